@@ -1,0 +1,164 @@
+// Filtered BRDFs of normal-mapped microstructure, for any C++ renderer.
+//
+// Nothing here knows a particular renderer. A host loads a normal map, builds a `Brdf` over it once per
+// material, and asks it three questions per shading point: `evaluate`, `pdf` and `sample`. `Brdf` is
+// immutable after construction and may be used by any number of threads at the same time.
+//
+// Conventions
+//   directions  unit vectors in the local shading frame; z is the shading normal, x and y run along the
+//               texture's u and v. `wi` points to the viewer, `wo` to the light; both point away from the
+//               surface. Below the horizon every answer is zero.
+//   footprint   in uv units (one period of the map is the unit square), u along the columns and v along
+//               the rows of the image, row 0 at v = 0. Outside [0, 1) the map repeats.
+//   values      `f(wi, wo) * cos(theta_o)` without Fresnel term and colour: the host multiplies by
+//               its own F(dot(wi, h)), with h the half vector.
+//
+// Errors: construction throws `glints::Error`; its text names the file and the parameter and says what to do.
+// Questions never throw and never abort.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#if defined(__GNUC__)
+#  define GLINTS_API __attribute__((visibility("default")))
+#else
+#  define GLINTS_API
+#endif
+
+namespace glints {
+
+/// Invalid input: a file that cannot be read, a bad normal, a parameter out of its domain.
+class GLINTS_API Error : public std::runtime_error {
+public:
+    using std::runtime_error::runtime_error;
+};
+
+struct Vec3 {
+    float x, y, z;
+};
+
+/// How a file stores a normal's components c.
+enum class Encoding : uint8_t {
+    Automatic, ///< `Unsigned` for integer formats, and for floating-point ones without negative components
+    Unsigned,  ///< n = 2 c - 1
+    Signed,    ///< n = c
+};
+
+/// How the texels of a footprint are weighted.
+enum class Normalization : uint8_t {
+    Projected, ///< by their share of the projected area: the NDF integrates to 1 against the cosine
+    Paper,     ///< by their share of the texture's area: the literal Eq. 5 of Atanasov et al. 2021
+};
+
+/// Shadowing and masking of the whole map (G_x); the flakes' own Smith term is always present.
+enum class Masking : uint8_t {
+    None,     ///< G_x = 1
+    Beckmann, ///< separable Smith term, roughness from the covariance of the map's slopes
+    Explicit, ///< the same with `masking_alpha_u`, `masking_alpha_v`
+};
+
+/// Parameters that every method shares.
+struct GLINTS_API SurfaceOptions {
+    float alpha = 0.01f; ///< Beckmann roughness of a flake, in [1e-4, 1]
+    Normalization normalization = Normalization::Projected;
+    Masking masking = Masking::Beckmann;
+    float masking_alpha_u = 0.f, masking_alpha_v = 0.f; ///< only for `Masking::Explicit`; both >= 0
+};
+
+/// Parameters of the inverse bin map; zero means "derive it as the paper does".
+struct GLINTS_API InverseBinMapOptions {
+    uint32_t bins = 0;      ///< bins per side of the square around the projected hemisphere; 0: floor(5 / sin theta_0)
+    uint32_t leaf_size = 0; ///< most texels of a leaf of the forest; 0: the paper's 10
+};
+
+/// A pixel's footprint: the parallelogram centred at (u, v), spanned by the two partial derivatives.
+struct Footprint {
+    float u, v;
+    float du_dx = 0.f, dv_dx = 0.f;
+    float du_dy = 0.f, dv_dy = 0.f;
+};
+
+/// `value` is f * cos(theta_o) without Fresnel and colour, `pdf` the density of `wo` per solid angle.
+struct Evaluation {
+    float value, pdf;
+};
+
+struct Sample {
+    Vec3 wo;
+    float value, pdf; ///< those of `evaluate(footprint, wi, wo)`
+    bool valid;       ///< false: no direction was drawn (masked, below the horizon, or cut off); counts as zero
+};
+
+/// A decoded, validated map of unit normals.
+class GLINTS_API NormalMap {
+public:
+    /// Reads an EXR, PNG, JPEG or TIFF file. `flip_y` negates the green component.
+    static NormalMap load(const std::string &filename, Encoding encoding = Encoding::Automatic,
+                          bool flip_y = false);
+    /// Takes `3 * width * height` components, row by row. Normals are normalised; `name` is used in errors.
+    static NormalMap from_normals(const std::string &name, uint32_t width, uint32_t height,
+                                  const std::vector<float> &xyz);
+
+    uint32_t width() const;
+    uint32_t height() const;
+    /// The unit normal of a texel; indices wrap around.
+    Vec3 normal(int64_t column, int64_t row) const;
+
+    struct Impl;
+    NormalMap(NormalMap &&) noexcept;
+    NormalMap &operator=(NormalMap &&) noexcept;
+    ~NormalMap();
+
+private:
+    explicit NormalMap(std::unique_ptr<Impl>);
+    std::unique_ptr<Impl> m_impl;
+    friend class Brdf;
+};
+
+/// What a method built, for tables and logs.
+struct Statistics {
+    std::string method;
+    uint64_t structure_bytes; ///< memory that `evaluate`, `pdf` and `sample` need
+    double build_seconds;     ///< wall time of the construction, without reading the file
+    uint32_t bins;            ///< bins per side; 0 for methods without bins
+    float masking_alpha_u, masking_alpha_v; ///< roughness of G_x along u and v; 0 without masking
+};
+
+/// A normal map filtered over footprints by one of the methods.
+class GLINTS_API Brdf {
+public:
+    /// Inverse bin map, Atanasov et al. 2021 (Sections 5.2-5.4).
+    static Brdf inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
+                                const InverseBinMapOptions &options = {});
+    /// The exact sum over every texel of the footprint (Eq. 11).
+    static Brdf direct(const NormalMap &map, const SurfaceOptions &surface);
+    /// The texel under the footprint's centre (Eq. 5), whatever the footprint.
+    static Brdf unfiltered(const NormalMap &map, const SurfaceOptions &surface);
+
+    Evaluation evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept;
+    /// `evaluate(...).value` alone, and `evaluate(...).pdf` alone.
+    float value(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept;
+    float pdf(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept;
+    /// Draws `wo`. `u1`, `u2`, `u3` are independent and uniform on [0, 1).
+    Sample sample(const Footprint &footprint, const Vec3 &wi, float u1, float u2, float u3) const noexcept;
+    /// The filtered distribution of normals D_A at the unit half vector `h`, per solid angle.
+    float ndf(const Footprint &footprint, const Vec3 &h) const noexcept;
+
+    Statistics statistics() const;
+
+    struct Impl;
+    Brdf(Brdf &&) noexcept;
+    Brdf &operator=(Brdf &&) noexcept;
+    ~Brdf();
+
+private:
+    explicit Brdf(std::unique_ptr<Impl>);
+    std::unique_ptr<Impl> m_impl;
+};
+
+} // namespace glints

@@ -1,0 +1,299 @@
+//! The whole FFI surface between the Rust library and C++; C++ programs use `cpp/include/glints/glints.h`, which wraps it.
+//!
+//! # Invariants
+//!
+//! * Errors cross as `Result`, which cxx turns into exceptions. Constructors run inside [`guarded`], so that not even a panic aborts
+//!   the host: it becomes an error, too.
+//! * Evaluation is total and free of panics; it takes plain values and a shared reference, from any thread.
+//! * This crate has no unsafe code of its own.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Instant;
+
+use glam::Vec3;
+use glints::brdf::{Brdf as Core, Masking};
+use glints::error::{Error, Result};
+use glints::flakes::{FlakeModel, Normalization};
+use glints::methods::Method;
+use glints::methods::direct::Direct;
+use glints::methods::inverse_bin_map::{self, InverseBinMap};
+use glints::methods::unfiltered::Unfiltered;
+use glints::microfacet::Flake;
+use glints::normal_map::{self, Encoding};
+
+#[cxx::bridge(namespace = "glints::bridge")]
+mod ffi {
+    // ---- values -------------------------------------------------------------------------------------------------------------
+
+    #[derive(Clone, Copy)]
+    struct Vector {
+        x: f32,
+        y: f32,
+        z: f32,
+    }
+
+    /// In uv units: centre and partial derivatives along the pixel's axes.
+    #[derive(Clone, Copy)]
+    struct Footprint {
+        uv: [f32; 2],
+        duv_dx: [f32; 2],
+        duv_dy: [f32; 2],
+    }
+
+    #[derive(Clone, Copy)]
+    struct Evaluation {
+        value: f32,
+        pdf: f32,
+    }
+
+    #[derive(Clone, Copy)]
+    struct Sample {
+        wo: Vector,
+        value: f32,
+        pdf: f32,
+        valid: bool,
+    }
+
+    #[derive(Clone, Copy)]
+    enum MapEncoding {
+        Automatic,
+        Unsigned,
+        Signed,
+    }
+
+    #[derive(Clone, Copy)]
+    enum MaskingKind {
+        None,
+        Beckmann,
+        Explicit,
+    }
+
+    #[derive(Clone, Copy)]
+    struct Surface {
+        alpha: f32,
+        projected: bool,
+        masking: MaskingKind,
+        masking_alpha_u: f32,
+        masking_alpha_v: f32,
+    }
+
+    struct Statistics {
+        method: String,
+        structure_bytes: u64,
+        build_seconds: f64,
+        bins: u32,
+        masking_alpha_u: f32,
+        masking_alpha_v: f32,
+    }
+
+    // ---- what C++ may call ------------------------------------------------------------------------------------------------
+
+    extern "Rust" {
+        type Map;
+        fn load_map(filename: &str, encoding: MapEncoding, flip_y: bool) -> Result<Box<Map>>;
+        fn map_from_normals(name: &str, width: u32, height: u32, xyz: &[f32]) -> Result<Box<Map>>;
+        fn width(self: &Map) -> u32;
+        fn height(self: &Map) -> u32;
+        fn normal(self: &Map, column: i64, row: i64) -> Vector;
+
+        type Brdf;
+        fn inverse_bin_map(map: &Map, surface: Surface, bins: u32, leaf_size: u32) -> Result<Box<Brdf>>;
+        fn direct(map: &Map, surface: Surface) -> Result<Box<Brdf>>;
+        fn unfiltered(map: &Map, surface: Surface) -> Result<Box<Brdf>>;
+        fn evaluate(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> Evaluation;
+        fn pdf(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> f32;
+        fn sample(self: &Brdf, footprint: Footprint, wi: Vector, u: [f32; 3]) -> Sample;
+        fn ndf(self: &Brdf, footprint: Footprint, h: Vector) -> f32;
+        fn statistics(self: &Brdf) -> Statistics;
+    }
+}
+
+// ---- normal maps --------------------------------------------------------------------------------------------------------------
+
+/// A shared, immutable normal map.
+pub struct Map(normal_map::NormalMap);
+
+fn load_map(filename: &str, encoding: ffi::MapEncoding, flip_y: bool) -> Result<Box<Map>> {
+    let encoding = match encoding {
+        ffi::MapEncoding::Unsigned => Encoding::Unsigned,
+        ffi::MapEncoding::Signed => Encoding::Signed,
+        _ => Encoding::Automatic,
+    };
+    guarded("filename", filename, || {
+        normal_map::NormalMap::load(filename, encoding, flip_y).map(|map| Box::new(Map(map)))
+    })
+}
+
+fn map_from_normals(name: &str, width: u32, height: u32, xyz: &[f32]) -> Result<Box<Map>> {
+    let normals: Vec<Vec3> = xyz.chunks_exact(3).map(Vec3::from_slice).collect();
+    guarded("filename", name, || {
+        normal_map::NormalMap::from_normals(name, width, height, &normals).map(|map| Box::new(Map(map)))
+    })
+}
+
+impl Map {
+    fn width(&self) -> u32 {
+        self.0.width()
+    }
+
+    fn height(&self) -> u32 {
+        self.0.height()
+    }
+
+    fn normal(&self, column: i64, row: i64) -> ffi::Vector {
+        let wrap = |i: i64, side: u32| i.rem_euclid(i64::from(side)) as u32;
+        let n = self
+            .0
+            .normal(wrap(column, self.0.width()), wrap(row, self.0.height()));
+        to_ffi(n)
+    }
+}
+
+// ---- BRDFs ----------------------------------------------------------------------------------------------------------------------
+
+/// A method over a map, and how long it took to build.
+pub struct Brdf {
+    core: Core,
+    build_seconds: f64,
+}
+
+fn inverse_bin_map(map: &Map, surface: ffi::Surface, bins: u32, leaf_size: u32) -> Result<Box<Brdf>> {
+    let options = inverse_bin_map::Options {
+        bins: (bins > 0).then_some(bins),
+        leaf_size: (leaf_size > 0).then_some(leaf_size),
+    };
+    build(map, surface, |model| {
+        Ok(Box::new(InverseBinMap::new(&map.0, model, options)?))
+    })
+}
+
+fn direct(map: &Map, surface: ffi::Surface) -> Result<Box<Brdf>> {
+    build(map, surface, |model| {
+        Ok(Box::new(Direct::new(map.0.clone(), model)))
+    })
+}
+
+fn unfiltered(map: &Map, surface: ffi::Surface) -> Result<Box<Brdf>> {
+    build(map, surface, |model| {
+        Ok(Box::new(Unfiltered::new(map.0.clone(), model)))
+    })
+}
+
+fn build(
+    map: &Map,
+    surface: ffi::Surface,
+    method: impl FnOnce(FlakeModel) -> Result<Box<dyn Method>>,
+) -> Result<Box<Brdf>> {
+    let masking = match surface.masking {
+        ffi::MaskingKind::Beckmann => Masking::Beckmann,
+        ffi::MaskingKind::Explicit => Masking::Explicit {
+            alpha_u: surface.masking_alpha_u,
+            alpha_v: surface.masking_alpha_v,
+        },
+        _ => Masking::None,
+    };
+    let normalization = if surface.projected {
+        Normalization::Projected
+    } else {
+        Normalization::Paper
+    };
+    guarded("filename", map.0.name(), || {
+        let flake = Flake::new(surface.alpha)?;
+        let mut build_seconds = 0.0;
+        let core = Core::new(&map.0, masking, || {
+            let start = Instant::now();
+            let method = method(FlakeModel { flake, normalization });
+            build_seconds = start.elapsed().as_secs_f64();
+            method
+        })?;
+        Ok(Box::new(Brdf { core, build_seconds }))
+    })
+}
+
+impl Brdf {
+    fn evaluate(&self, footprint: ffi::Footprint, wi: ffi::Vector, wo: ffi::Vector) -> ffi::Evaluation {
+        let e = self
+            .core
+            .evaluate(&self.footprint(footprint), from_ffi(wi), from_ffi(wo));
+        ffi::Evaluation {
+            value: e.value,
+            pdf: e.pdf,
+        }
+    }
+
+    fn pdf(&self, footprint: ffi::Footprint, wi: ffi::Vector, wo: ffi::Vector) -> f32 {
+        self.core
+            .pdf(&self.footprint(footprint), from_ffi(wi), from_ffi(wo))
+    }
+
+    fn sample(&self, footprint: ffi::Footprint, wi: ffi::Vector, u: [f32; 3]) -> ffi::Sample {
+        let drawn = self.core.sample(&self.footprint(footprint), from_ffi(wi), u);
+        drawn.map_or(
+            ffi::Sample {
+                wo: to_ffi(Vec3::ZERO),
+                value: 0.0,
+                pdf: 0.0,
+                valid: false,
+            },
+            |s| ffi::Sample {
+                wo: to_ffi(s.wo),
+                value: s.evaluation.value,
+                pdf: s.evaluation.pdf,
+                valid: true,
+            },
+        )
+    }
+
+    fn ndf(&self, footprint: ffi::Footprint, h: ffi::Vector) -> f32 {
+        self.core.ndf(&self.footprint(footprint), from_ffi(h))
+    }
+
+    fn statistics(&self) -> ffi::Statistics {
+        let (masking_alpha_u, masking_alpha_v) = self.core.masking_alphas();
+        let method = self.core.method();
+        ffi::Statistics {
+            method: method.name().into(),
+            structure_bytes: method.structure_bytes() as u64,
+            build_seconds: self.build_seconds,
+            bins: method.bins().unwrap_or(0),
+            masking_alpha_u,
+            masking_alpha_v,
+        }
+    }
+
+    fn footprint(&self, f: ffi::Footprint) -> glints::footprint::Footprint {
+        self.core.footprint(f.uv, f.duv_dx, f.duv_dy)
+    }
+}
+
+// ---- crossing -------------------------------------------------------------------------------------------------------------------
+
+fn from_ffi(v: ffi::Vector) -> Vec3 {
+    Vec3::new(v.x, v.y, v.z)
+}
+
+fn to_ffi(v: Vec3) -> ffi::Vector {
+    ffi::Vector {
+        x: v.x,
+        y: v.y,
+        z: v.z,
+    }
+}
+
+/// Runs a constructor; a panic, which would abort the host on its way through C++, becomes an error about `name`.
+fn guarded<T>(name: &'static str, value: &str, construct: impl FnOnce() -> Result<T>) -> Result<T> {
+    catch_unwind(AssertUnwindSafe(construct)).unwrap_or_else(|panic| {
+        let text = panic
+            .downcast_ref::<String>()
+            .map(String::as_str)
+            .or_else(|| panic.downcast_ref::<&str>().copied());
+        Err(Error::Parameter {
+            name,
+            value: value.into(),
+            reason: format!(
+                "an internal error occurred, please report it: {}",
+                text.unwrap_or("no message")
+            ),
+        })
+    })
+}

@@ -1,0 +1,35 @@
+//! Directions and half vectors in the local shading frame.
+
+use glam::Vec3;
+
+/// Two directions above the horizon and their half vector.
+#[derive(Clone, Copy, Debug)]
+pub struct DirectionPair {
+    /// Towards the viewer.
+    pub wi: Vec3,
+    /// Towards the light.
+    pub wo: Vec3,
+    /// `(wi + wo) / |wi + wo|`; `half.z > 0`.
+    pub half: Vec3,
+}
+
+impl DirectionPair {
+    /// `None` unless both unit vectors are above the horizon.
+    #[inline]
+    pub fn new(wi: Vec3, wo: Vec3) -> Option<Self> {
+        let above = wi.z > 0.0 && wo.z > 0.0;
+        let half = (wi + wo).try_normalize()?;
+        above.then_some(Self { wi, wo, half })
+    }
+
+    /// The pair that reflects `wi` at the normal `half`; `None` if `wi` or the reflection is not above both horizons.
+    #[inline]
+    pub fn reflected(wi: Vec3, half: Vec3) -> Option<Self> {
+        let cos = wi.dot(half);
+        if cos <= 0.0 || wi.z <= 0.0 {
+            return None;
+        }
+        let wo = (2.0 * cos * half - wi).normalize();
+        (wo.z > 0.0).then_some(Self { wi, wo, half })
+    }
+}

@@ -1,0 +1,61 @@
+//! One module per published method; each answers the three questions of [`Method`] over a footprint.
+
+pub mod direct;
+pub mod inverse_bin_map;
+pub mod unfiltered;
+
+use glam::Vec3;
+
+use crate::footprint::Footprint;
+use crate::half_vector::DirectionPair;
+
+/// A distribution of normals that can be filtered over footprints.
+///
+/// Fresnel term, colour and the whole map's shadowing `G_x` are the caller's; a method sees a footprint and
+/// directions above the horizon, and is total: every input has an answer.
+///
+/// `sample` and the density of [`Method::evaluate`] are exact partners: what `sample` draws has that density per solid
+/// angle, and where `sample` gives up with some probability, the density integrates to one minus that probability.
+pub trait Method: Send + Sync {
+    /// The reflection `R` and the density of `pair.half` under [`Method::sample`], both over the footprint:
+    ///
+    /// ```text
+    /// R = sum_k w_k D^alpha(h, t_k) G1(i, t_k) G1(o, t_k)   [/ (t_k . n) when normalized by projected area]
+    /// ```
+    ///
+    /// so that the BRDF is `F(i, h) G_x R / (4 (i . n) (o . n))`, Eq. 11 of Atanasov et al. 2021.
+    fn evaluate(&self, footprint: &Footprint, pair: &DirectionPair) -> Reflection;
+
+    /// The density of the half vector `h` under [`Method::sample`], per solid angle.
+    fn density(&self, footprint: &Footprint, h: Vec3) -> f32;
+
+    /// The filtered distribution of normals `D_A(h)`, per solid angle: `R` without shadowing.
+    fn ndf(&self, footprint: &Footprint, h: Vec3) -> f32;
+
+    /// Draws a half vector: `u[0..2]` choose the point of the footprint, `u[2..4]` the normal of the flake there.
+    /// `None`: the draw failed and counts as zero.
+    fn sample(&self, footprint: &Footprint, u: [f32; 4]) -> Option<Vec3>;
+
+    /// Columns and rows of the map.
+    fn map_size(&self) -> (u32, u32);
+
+    /// Bytes that evaluation, density and sampling need.
+    fn structure_bytes(&self) -> usize;
+
+    /// Bins per side, for the methods that have bins.
+    fn bins(&self) -> Option<u32> {
+        None
+    }
+
+    /// The name under which people ask for the method.
+    fn name(&self) -> &'static str;
+}
+
+/// What [`Method::evaluate`] answers.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Reflection {
+    /// `R`, per solid angle of half vectors.
+    pub value: f32,
+    /// Density of the half vector, per solid angle.
+    pub density: f32,
+}

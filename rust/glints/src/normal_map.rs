@@ -1,0 +1,333 @@
+//! A decoded, validated normal map: the input of every method.
+//!
+//! A map is `width * height` unit normals in the local shading frame (x along u, y along v, z up), row by row,
+//! row 0 at v = 0. The texel with column `i` and row `j` covers `[i, i+1) x [j, j+1)` of texel space, and the
+//! map repeats in both directions. Interpolation is never applied: the surface is piecewise flat, one mirror
+//! (or rough flake) per texel, as in Atanasov et al. 2021, Section 3.2.
+//!
+//! Validation happens here, once: components are finite, lengths are not zero, and every normal points out of
+//! the surface (`z >= MIN_Z`). Methods rely on it and check nothing again.
+
+use std::path::Path;
+
+use glam::{DVec2, Vec3};
+use image::{DynamicImage, ImageReader, Limits};
+
+use crate::error::{Error, Result};
+
+/// Smallest z of a unit normal. Steeper texels (slopes beyond 1000) carry no projected area that single
+/// precision could resolve, and the projected normalization divides by z.
+pub const MIN_Z: f32 = 1e-3;
+
+/// Most texels per side; texel indices must fit into 32 bits.
+const MAX_SIDE: u32 = 65_535;
+
+/// How a file stores a normal's components c.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Encoding {
+    /// `Unsigned` for integer formats and for floating-point ones without negative components, else `Signed`.
+    #[default]
+    Automatic,
+    /// n = 2 c - 1, with c in [0, 1].
+    Unsigned,
+    /// n = c.
+    Signed,
+}
+
+/// Unit normals on a grid of texels; see the module for layout and guarantees.
+#[derive(Clone, Debug)]
+pub struct NormalMap {
+    name: String,
+    width: u32,
+    height: u32,
+    normals: Vec<Vec3>,
+}
+
+/// Covariance of the map's slopes (-x/z, -y/z), every texel weighted alike.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SlopeCovariance {
+    pub xx: f64,
+    pub xy: f64,
+    pub yy: f64,
+}
+
+impl NormalMap {
+    /// Reads an EXR, PNG, JPEG or TIFF file; the format is recognised by content. `flip_y` negates the y component.
+    pub fn load(path: impl AsRef<Path>, encoding: Encoding, flip_y: bool) -> Result<Self> {
+        let path = path.as_ref();
+        let image = decode(path)?;
+        let (width, height) = (image.width(), image.height());
+        let is_float = matches!(
+            image,
+            DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_)
+        );
+        if image.color().channel_count() < 3 {
+            return Err(Error::File {
+                path: path.into(),
+                reason: "has fewer than three channels; a normal map needs red, green and blue".into(),
+            });
+        }
+        let texels = image.into_rgb32f().into_raw();
+        let signed = match encoding {
+            Encoding::Automatic => is_float && texels.iter().any(|&c| c < 0.0),
+            Encoding::Unsigned => false,
+            Encoding::Signed => true,
+        };
+        let flip = if flip_y { -1.0 } else { 1.0 };
+        let decode_component = |c: f32| if signed { c } else { 2.0 * c - 1.0 };
+        let vectors = texels.chunks_exact(3).map(|c| {
+            Vec3::new(
+                decode_component(c[0]),
+                flip * decode_component(c[1]),
+                decode_component(c[2]),
+            )
+        });
+        // An 8-bit "no normal" (128, 128, 128) decodes to length 0.007, not to zero.
+        let min_length = if signed { 1e-6 } else { 1e-2 };
+        Self::from_vectors(path.display().to_string(), width, height, vectors, min_length)
+    }
+
+    /// Takes `width * height` vectors of any positive length; `name` stands for the file in errors.
+    pub fn from_normals(name: impl Into<String>, width: u32, height: u32, normals: &[Vec3]) -> Result<Self> {
+        let name = name.into();
+        if normals.len() as u64 != u64::from(width) * u64::from(height) {
+            let reason = format!(
+                "has {} normals, but {width} x {height} texels need {}",
+                normals.len(),
+                u64::from(width) * u64::from(height)
+            );
+            return Err(Error::Map { map: name, reason });
+        }
+        Self::from_vectors(name, width, height, normals.iter().copied(), 1e-6)
+    }
+
+    fn from_vectors(
+        name: String,
+        width: u32,
+        height: u32,
+        vectors: impl Iterator<Item = Vec3>,
+        min_length: f32,
+    ) -> Result<Self> {
+        let invalid = |reason: String| Error::Map {
+            map: name.clone(),
+            reason,
+        };
+        if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+            return Err(invalid(format!(
+                "is {width} x {height} texels; a side must have 1 to {MAX_SIDE}"
+            )));
+        }
+        let normals = vectors
+            .enumerate()
+            .map(|(index, vector)| {
+                unit_normal(vector, min_length).map_err(|problem| {
+                    let (column, row) = (index % width as usize, index / width as usize);
+                    invalid(format!(
+                        "texel (column {column}, row {row}) decodes to ({}, {}, {}), {problem}",
+                        vector.x, vector.y, vector.z
+                    ))
+                })
+            })
+            .collect::<Result<Vec<_>>>()?;
+        Ok(Self {
+            name,
+            width,
+            height,
+            normals,
+        })
+    }
+
+    /// Where the map came from; used in messages.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    pub fn width(&self) -> u32 {
+        self.width
+    }
+
+    pub fn height(&self) -> u32 {
+        self.height
+    }
+
+    /// Unit normals, row by row; `width * height` of them.
+    pub fn normals(&self) -> &[Vec3] {
+        &self.normals
+    }
+
+    /// The unit normal of the texel at `column < width`, `row < height`.
+    pub fn normal(&self, column: u32, row: u32) -> Vec3 {
+        self.normals[row as usize * self.width as usize + column as usize]
+    }
+
+    /// Covariance of the slopes over all texels, in double precision.
+    pub fn slope_covariance(&self) -> SlopeCovariance {
+        let slope = |n: &Vec3| DVec2::new(f64::from(-n.x), f64::from(-n.y)) / f64::from(n.z);
+        let count = self.normals.len() as f64;
+        let mean = self.normals.iter().map(slope).sum::<DVec2>() / count;
+        let mut sum = SlopeCovariance {
+            xx: 0.0,
+            xy: 0.0,
+            yy: 0.0,
+        };
+        for normal in &self.normals {
+            let d = slope(normal) - mean;
+            sum.xx += d.x * d.x;
+            sum.xy += d.x * d.y;
+            sum.yy += d.y * d.y;
+        }
+        SlopeCovariance {
+            xx: sum.xx / count,
+            xy: sum.xy / count,
+            yy: sum.yy / count,
+        }
+    }
+}
+
+fn decode(path: &Path) -> Result<DynamicImage> {
+    let failed = |reason: String| Error::File {
+        path: path.into(),
+        reason,
+    };
+    let open = || ImageReader::open(path)?.with_guessed_format();
+    let mut reader = open().map_err(|e| {
+        failed(format!(
+            "cannot be opened ({e}); check the path and the permissions"
+        ))
+    })?;
+    // Maps of 16K x 16K texels are legitimate; their side is checked after decoding.
+    reader.limits(Limits::no_limits());
+    reader.decode().map_err(|e| {
+        failed(format!(
+            "cannot be decoded ({e}); an EXR, PNG, JPEG or TIFF file with red, green and blue is needed"
+        ))
+    })
+}
+
+fn unit_normal(vector: Vec3, min_length: f32) -> std::result::Result<Vec3, &'static str> {
+    if !vector.is_finite() {
+        return Err("which is not finite; repair the file");
+    }
+    let length = vector.as_dvec3().length();
+    if length < f64::from(min_length) {
+        return Err("which has no length; repair the file or check the parameter \"encoding\"");
+    }
+    let normal = (vector.as_dvec3() / length).as_vec3();
+    if normal.z < MIN_Z {
+        return Err(
+            "which does not point out of the surface; repair the file or check the parameter \"encoding\"",
+        );
+    }
+    Ok(normal)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use approx::assert_relative_eq;
+    use image::{ImageBuffer, Rgb};
+    use std::path::PathBuf;
+
+    /// A file in the temporary folder that is removed again.
+    struct TemporaryFile(PathBuf);
+
+    impl TemporaryFile {
+        fn new(name: &str) -> Self {
+            Self(std::env::temp_dir().join(format!("glints-{}-{name}", std::process::id())))
+        }
+    }
+
+    impl Drop for TemporaryFile {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_file(&self.0);
+        }
+    }
+
+    fn write_floats(name: &str, texels: [[f32; 3]; 2]) -> TemporaryFile {
+        let file = TemporaryFile::new(name);
+        let image = ImageBuffer::from_fn(2, 1, |x, _| Rgb(texels[x as usize]));
+        DynamicImage::ImageRgb32F(image).save(&file.0).unwrap();
+        file
+    }
+
+    fn load_error(name: &str, texels: [[f32; 3]; 2]) -> String {
+        let file = write_floats(name, texels);
+        NormalMap::load(&file.0, Encoding::Automatic, false)
+            .unwrap_err()
+            .to_string()
+    }
+
+    #[test]
+    fn integer_formats_are_unsigned() {
+        for name in ["unsigned.png", "unsigned.tiff"] {
+            let file = TemporaryFile::new(name);
+            let texel = Rgb([255_u8, 0, 255]);
+            ImageBuffer::from_pixel(3, 2, texel).save(&file.0).unwrap();
+            let map = NormalMap::load(&file.0, Encoding::Automatic, false).unwrap();
+            assert_eq!((map.width(), map.height()), (3, 2));
+            assert!(
+                map.normal(2, 1)
+                    .abs_diff_eq(Vec3::new(1.0, -1.0, 1.0).normalize(), 1e-6)
+            );
+            let flipped = NormalMap::load(&file.0, Encoding::Automatic, true).unwrap();
+            assert!(flipped.normal(0, 0).abs_diff_eq(Vec3::ONE.normalize(), 1e-6));
+        }
+    }
+
+    #[test]
+    fn floating_point_formats_are_signed_when_a_component_is_negative() {
+        let file = write_floats("signed.exr", [[-0.6, 0.0, 0.8], [0.0, 0.0, 1.0]]);
+        let map = NormalMap::load(&file.0, Encoding::Automatic, false).unwrap();
+        assert!(map.normal(0, 0).abs_diff_eq(Vec3::new(-0.6, 0.0, 0.8), 1e-6));
+        let file = write_floats("positive.exr", [[0.2, 0.5, 0.9], [0.5, 0.5, 1.0]]);
+        let map = NormalMap::load(&file.0, Encoding::Automatic, false).unwrap();
+        assert!(map.normal(0, 0).abs_diff_eq(Vec3::new(-0.6, 0.0, 0.8), 1e-6));
+        let map = NormalMap::load(&file.0, Encoding::Signed, false).unwrap();
+        assert!(
+            map.normal(0, 0)
+                .abs_diff_eq(Vec3::new(0.2, 0.5, 0.9).normalize(), 1e-6)
+        );
+    }
+
+    #[test]
+    fn errors_name_the_file_the_texel_and_the_remedy() {
+        let up = [0.0, 0.0, 1.0];
+        let message = load_error("nan.exr", [up, [f32::NAN, 0.0, 1.0]]);
+        assert!(
+            message.contains("nan.exr") && message.contains("column 1, row 0"),
+            "{message}"
+        );
+        assert!(load_error("zero.exr", [up, [-0.0, 0.0, 0.0]]).contains("zero.exr"));
+        assert!(load_error("down.exr", [[0.6, 0.0, -0.8], up]).contains("out of the surface"));
+        let missing = NormalMap::load("no/such.exr", Encoding::Automatic, false).unwrap_err();
+        assert!(missing.to_string().contains("no/such.exr"));
+    }
+
+    #[test]
+    fn grey_and_broken_files_are_refused() {
+        let grey = TemporaryFile::new("grey.png");
+        ImageBuffer::from_pixel(2, 2, image::Luma([128_u8]))
+            .save(&grey.0)
+            .unwrap();
+        let error = |path| {
+            NormalMap::load(path, Encoding::Automatic, false)
+                .unwrap_err()
+                .to_string()
+        };
+        assert!(error(&grey.0).contains("three channels"));
+        let broken = TemporaryFile::new("broken.png");
+        std::fs::write(&broken.0, b"\x89PNG\r\n\x1a\nnothing more").unwrap();
+        assert!(error(&broken.0).contains("cannot be decoded"));
+    }
+
+    #[test]
+    fn slope_covariance_is_that_of_the_slopes() {
+        let normals =
+            [(0.3, 0.1), (-0.3, -0.1), (0.1, -0.2), (-0.1, 0.2)].map(|(x, y)| Vec3::new(-x, -y, 1.0));
+        let map = NormalMap::from_normals("four", 2, 2, &normals).unwrap();
+        let covariance = map.slope_covariance();
+        assert_relative_eq!(covariance.xx, 0.05, epsilon = 1e-6);
+        assert_relative_eq!(covariance.yy, 0.025, epsilon = 1e-6);
+        assert_relative_eq!(covariance.xy, 0.005, epsilon = 1e-6);
+    }
+}
