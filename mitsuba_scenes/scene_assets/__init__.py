@@ -1,0 +1,1 @@
+"""Generators of the meshes, normal maps and environments of the project's own scenes (numpy only)."""
