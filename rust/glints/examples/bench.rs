@@ -171,7 +171,7 @@ fn random_footprint(random: &mut Random, (columns, rows): (u32, u32), width: f64
     Footprint::in_texels(columns, rows, center, a, a.perp())
 }
 
-/// Mean time of a call over whole rounds of all queries, the least of three measurements.
+/// Mean time of a call over whole rounds of all queries, the least of nine measurements.
 fn nanoseconds(queries: &[Query], seconds: f64, call: impl Fn(&Query) -> f32) -> f64 {
     let round = |queries: &[Query]| {
         let start = Instant::now();
@@ -184,9 +184,9 @@ fn nanoseconds(queries: &[Query], seconds: f64, call: impl Fn(&Query) -> f32) ->
     let first = round(&queries[..8]) / 8.0;
     let used = ((seconds / first.max(1e-9)) as usize).clamp(8, queries.len());
     let mut least = f64::INFINITY;
-    for _ in 0..3 {
+    for _ in 0..9 {
         let (mut total, mut rounds) = (0.0, 0);
-        while total < seconds / 3.0 {
+        while total < seconds / 9.0 {
             total += round(&queries[..used]);
             rounds += 1;
         }

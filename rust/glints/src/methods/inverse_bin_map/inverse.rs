@@ -13,12 +13,15 @@
 //!   down. Words have 16 bits; a node of more than [`NARROW`] texels, of which there are few, takes two for each number.
 //! * `roots` and `has_tree`: the positions of the trees' roots, ranked by a bit vector over the bins.
 //!
-//! **Construction** One counting sort by bin that visits the texels in kd order: every list comes out sorted. The trees are then read
-//! off the lists by binary search. Time O(N log N) with a small constant, memory the result plus one counter a bin.
+//! **Construction** One counting sort by bin that visits the texels in kd order: every list comes out sorted, whatever the
+//! number of threads. The trees are then read off the lists by binary search. Time O(N log N) with a small constant, memory the result plus one counter a bin.
 //!
 //! **Query** All bins of a neighbourhood descend together, so each node's box meets the footprint once. A node inside the footprint
 //! contributes its count; only cut leaves look at texels.
 
+use std::ops::Range;
+
+use arrayvec::ArrayVec;
 use rayon::prelude::*;
 
 use super::bins::{Bin, Neighbourhood, SLOTS, unpack};
@@ -50,7 +53,7 @@ struct Cell {
 }
 
 /// The texels of one bin inside a cell: a range of `texels`, and the position of the node if it is an inner one.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy)]
 struct Node {
     slot: u32,
     start: u32,
@@ -58,11 +61,8 @@ struct Node {
     position: u32,
 }
 
-/// At most one node a bin of the neighbourhood.
-struct Nodes {
-    nodes: [Node; SLOTS],
-    len: usize,
-}
+/// At most one node a bin of the neighbourhood, empty ones left out.
+type Nodes = ArrayVec<Node, SLOTS>;
 
 impl InverseMap {
     /// Inverts `bin_map`, `size.0 * size.1` packed bins on a grid of `resolution^2`; `leaf_size >= 1`.
@@ -72,15 +72,7 @@ impl InverseMap {
             y as usize * resolution as usize + x as usize
         };
         let starts = list_starts(bin_map.iter().map(|&b| index(b)), resolution);
-        let mut cursors = starts[..starts.len() - 1].to_vec();
-        let mut texels = vec![0; bin_map.len()];
-        Cell::whole(size).for_each_texel(&mut |x, y| {
-            let texel = y * size.0 + x;
-            let cursor = &mut cursors[index(bin_map[texel as usize])];
-            texels[*cursor as usize] = texel;
-            *cursor += 1;
-        });
-        drop(cursors);
+        let texels = sorted_texels(&starts, size, |texel| index(bin_map[texel as usize]));
         let mut map = Self {
             size,
             resolution,
@@ -121,12 +113,13 @@ impl InverseMap {
         for (slot, bin) in bins.bins() {
             let j = self.bin_index(bin);
             let count = self.starts[j + 1] - self.starts[j];
-            nodes.push(Node {
+            let node = Node {
                 slot: slot as u32,
                 start: self.starts[j],
                 count,
                 position: self.root(j, count),
-            });
+            };
+            push(&mut nodes, node);
         }
         self.visit(region, Cell::whole(self.size), &nodes, areas);
     }
@@ -148,26 +141,26 @@ impl InverseMap {
         match region.coverage(low, high) {
             Coverage::Outside => {}
             Coverage::Inside => {
-                for node in nodes.as_slice() {
+                for node in nodes {
                     areas[node.slot as usize] += f64::from(node.count);
                 }
             }
             Coverage::Cut => {
                 let (mut left, mut right) = (Nodes::new(), Nodes::new());
-                for node in nodes.as_slice() {
+                for node in nodes {
                     if node.count > self.leaf_size {
                         let (l, r) = self.children(node);
-                        left.push(l);
-                        right.push(r);
+                        push(&mut left, l);
+                        push(&mut right, r);
                     } else {
                         areas[node.slot as usize] += self.leaf_area(region, node);
                     }
                 }
                 let (first, second) = cell.halves();
-                if left.len > 0 {
+                if !left.is_empty() {
                     self.visit(region, first, &left, areas);
                 }
-                if right.len > 0 {
+                if !right.is_empty() {
                     self.visit(region, second, &right, areas);
                 }
             }
@@ -286,25 +279,49 @@ fn list_starts(bins: impl Iterator<Item = usize>, resolution: u32) -> Vec<u32> {
     starts
 }
 
-impl Nodes {
-    fn new() -> Self {
-        Self {
-            nodes: [Node::default(); SLOTS],
-            len: 0,
-        }
+/// The texels sorted by bin, and within a bin in the order of the trees. Every thread goes through all texels and keeps
+/// those of its own range of bins.
+fn sorted_texels(starts: &[u32], size: (u32, u32), bin_of: impl Fn(u32) -> usize + Sync) -> Vec<u32> {
+    let mut texels = vec![0; *starts.last().unwrap_or(&0) as usize];
+    let mut rest = texels.as_mut_slice();
+    let mut tasks = Vec::new();
+    for bins in balanced_ranges(starts, rayon::current_num_threads()) {
+        let count = starts[bins.end] - starts[bins.start];
+        let (lists, others) = std::mem::take(&mut rest).split_at_mut(count as usize);
+        rest = others;
+        tasks.push((bins, lists));
     }
+    tasks.into_par_iter().for_each(|(bins, lists)| {
+        let base = starts[bins.start];
+        let mut cursors: Vec<u32> = starts[bins.clone()].iter().map(|s| s - base).collect();
+        Cell::whole(size).for_each_texel(&mut |x, y| {
+            let texel = y * size.0 + x;
+            if let Some(cursor) = cursors.get_mut(bin_of(texel).wrapping_sub(bins.start)) {
+                lists[*cursor as usize] = texel;
+                *cursor += 1;
+            }
+        });
+    });
+    texels
+}
 
-    /// Adds a node unless it is empty.
-    #[inline]
-    fn push(&mut self, node: Node) {
-        if node.count > 0 {
-            self.nodes[self.len] = node;
-            self.len += 1;
-        }
-    }
+/// Cuts the bins into `count` ranges of about as many texels each; some may be empty.
+fn balanced_ranges(starts: &[u32], count: usize) -> Vec<Range<usize>> {
+    let (bins, total) = (starts.len() - 1, u64::from(starts[starts.len() - 1]));
+    let bound = |k: usize| match k {
+        0 => 0,
+        k if k == count => bins,
+        k => starts
+            .partition_point(|&s| u64::from(s) < total * k as u64 / count as u64)
+            .min(bins),
+    };
+    (0..count).map(|k| bound(k)..bound(k + 1)).collect()
+}
 
-    fn as_slice(&self) -> &[Node] {
-        &self.nodes[..self.len]
+#[inline]
+fn push(nodes: &mut Nodes, node: Node) {
+    if node.count > 0 {
+        nodes.push(node);
     }
 }
 

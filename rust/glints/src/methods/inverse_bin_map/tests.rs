@@ -128,7 +128,7 @@ fn large_footprints_walk_the_forest() {
     let ibm = build(&map, 0.05, 40, 10);
     let (a, b) = (DVec2::new(260.0, 80.0), DVec2::new(-60.0, 300.0));
     let footprint = Footprint::in_texels(600, 400, DVec2::new(590.0, 10.0), a, b);
-    assert!(footprint.area() > SCAN_TEXELS);
+    assert!(footprint.area() > SCAN_FACTOR * 240_000_f64.powf(0.25));
     let h = Vec3::new(0.05, -0.1, 1.0).normalize();
     let (_, weights) = ibm.bin_weights(&footprint, h);
     let expected = direct_weights(&map, &ibm, &footprint, h);
