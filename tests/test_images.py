@@ -16,8 +16,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "scripts"), str(ROOT / "mitsuba_scenes")]
 
-import generate  # noqa: E402
-from glints_harness import methods, render, scenes  # noqa: E402
+import generate
+from glints_harness import methods, render, scenes
 
 ALPHA = "0.02"  # heavy tails of smaller roughnesses would need a reference of minutes
 SIDE, BLOCK = 32, 16  # pixels of the crop and of a block
@@ -74,9 +74,7 @@ class Crop:
             scene = dataclasses.replace(scene, values={**scene.values, "normalmap": str(normal_map)})
         loaded = render.LoadedScene(scene.text(methods.METHODS[method], 1))
         lighting = render.Lighting(footprint=footprint)
-        return Images(
-            np.stack([loaded.render(self.view, lighting, spp, seed).image.mean(-1) for seed in seeds])
-        )
+        return Images(np.stack([loaded.render(self.view, lighting, spp, seed).image.mean(-1) for seed in seeds]))
 
     def brightness_is_right(self, images):
         """Every block's mean agrees within five standard errors plus the stated bias."""

@@ -11,37 +11,42 @@ namespace glints {
 
 namespace {
 
-bridge::Vector to_bridge(const Vec3 &v) { return { v.x, v.y, v.z }; }
+bridge::Vector to_bridge(const Vec3 &v) { return {v.x, v.y, v.z}; }
 
-Vec3 from_bridge(const bridge::Vector &v) { return { v.x, v.y, v.z }; }
+Vec3 from_bridge(const bridge::Vector &v) { return {v.x, v.y, v.z}; }
 
-bridge::Footprint to_bridge(const Footprint &f) {
-    return { { f.u, f.v }, { f.du_dx, f.dv_dx }, { f.du_dy, f.dv_dy } };
-}
+bridge::Footprint to_bridge(const Footprint &f) { return {{f.u, f.v}, {f.du_dx, f.dv_dx}, {f.du_dy, f.dv_dy}}; }
 
 bridge::MapEncoding to_bridge(Encoding encoding) {
     switch (encoding) {
-        case Encoding::Unsigned: return bridge::MapEncoding::Unsigned;
-        case Encoding::Signed: return bridge::MapEncoding::Signed;
-        default: return bridge::MapEncoding::Automatic;
+    case Encoding::Unsigned:
+        return bridge::MapEncoding::Unsigned;
+    case Encoding::Signed:
+        return bridge::MapEncoding::Signed;
+    default:
+        return bridge::MapEncoding::Automatic;
     }
 }
 
 bridge::MaskingKind to_bridge(Masking masking) {
     switch (masking) {
-        case Masking::Beckmann: return bridge::MaskingKind::Beckmann;
-        case Masking::Explicit: return bridge::MaskingKind::Explicit;
-        default: return bridge::MaskingKind::None;
+    case Masking::Beckmann:
+        return bridge::MaskingKind::Beckmann;
+    case Masking::Explicit:
+        return bridge::MaskingKind::Explicit;
+    default:
+        return bridge::MaskingKind::None;
     }
 }
 
 bridge::Surface to_bridge(const SurfaceOptions &o) {
-    return { o.alpha, o.normalization == Normalization::Projected, to_bridge(o.masking), o.masking_alpha_u,
-             o.masking_alpha_v };
+    return {o.alpha, o.normalization == Normalization::Projected, to_bridge(o.masking), o.masking_alpha_u,
+            o.masking_alpha_v};
 }
 
 // Calls a constructor of the bridge; its errors become ours, with the same text.
-template <typename Construct> auto translated(Construct construct) {
+template <typename Construct>
+auto translated(Construct construct) {
     try {
         return construct();
     } catch (const rust::Error &error) {
@@ -58,15 +63,15 @@ struct NormalMap::Impl {
 };
 
 NormalMap::NormalMap(std::unique_ptr<Impl> impl) : m_impl(std::move(impl)) {}
-NormalMap::NormalMap(NormalMap &&) noexcept            = default;
+NormalMap::NormalMap(NormalMap &&) noexcept = default;
 NormalMap &NormalMap::operator=(NormalMap &&) noexcept = default;
-NormalMap::~NormalMap()                                = default;
+NormalMap::~NormalMap() = default;
 
 NormalMap NormalMap::load(const std::string &filename, Encoding encoding, bool flip_y) {
     return translated([&] {
         // Throws on invalid UTF-8, which a Rust string cannot hold.
         rust::Str name(filename);
-        return NormalMap(std::make_unique<Impl>(Impl{ bridge::load_map(name, to_bridge(encoding), flip_y) }));
+        return NormalMap(std::make_unique<Impl>(Impl{bridge::load_map(name, to_bridge(encoding), flip_y)}));
     });
 }
 
@@ -74,16 +79,13 @@ NormalMap NormalMap::from_normals(const std::string &name, uint32_t width, uint3
                                   const std::vector<float> &xyz) {
     return translated([&] {
         rust::Slice<const float> components(xyz.data(), xyz.size());
-        return NormalMap(
-            std::make_unique<Impl>(Impl{ bridge::map_from_normals(name, width, height, components) }));
+        return NormalMap(std::make_unique<Impl>(Impl{bridge::map_from_normals(name, width, height, components)}));
     });
 }
 
 uint32_t NormalMap::width() const { return m_impl->map->width(); }
 uint32_t NormalMap::height() const { return m_impl->map->height(); }
-Vec3 NormalMap::normal(int64_t column, int64_t row) const {
-    return from_bridge(m_impl->map->normal(column, row));
-}
+Vec3 NormalMap::normal(int64_t column, int64_t row) const { return from_bridge(m_impl->map->normal(column, row)); }
 
 // ---- Brdf --------------------------------------------------------------------------------------------------------------------
 
@@ -92,33 +94,30 @@ struct Brdf::Impl {
 };
 
 Brdf::Brdf(std::unique_ptr<Impl> impl) : m_impl(std::move(impl)) {}
-Brdf::Brdf(Brdf &&) noexcept            = default;
+Brdf::Brdf(Brdf &&) noexcept = default;
 Brdf &Brdf::operator=(Brdf &&) noexcept = default;
-Brdf::~Brdf()                           = default;
+Brdf::~Brdf() = default;
 
-Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
-                           const InverseBinMapOptions &options) {
+Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, const InverseBinMapOptions &options) {
     return translated([&] {
-        return Brdf(std::make_unique<Impl>(Impl{ bridge::inverse_bin_map(
-            *map.m_impl->map, to_bridge(surface), options.bins, options.leaf_size) }));
+        return Brdf(std::make_unique<Impl>(
+            Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), options.bins, options.leaf_size)}));
     });
 }
 
 Brdf Brdf::direct(const NormalMap &map, const SurfaceOptions &surface) {
-    return translated([&] {
-        return Brdf(std::make_unique<Impl>(Impl{ bridge::direct(*map.m_impl->map, to_bridge(surface)) }));
-    });
+    return translated(
+        [&] { return Brdf(std::make_unique<Impl>(Impl{bridge::direct(*map.m_impl->map, to_bridge(surface))})); });
 }
 
 Brdf Brdf::unfiltered(const NormalMap &map, const SurfaceOptions &surface) {
-    return translated([&] {
-        return Brdf(std::make_unique<Impl>(Impl{ bridge::unfiltered(*map.m_impl->map, to_bridge(surface)) }));
-    });
+    return translated(
+        [&] { return Brdf(std::make_unique<Impl>(Impl{bridge::unfiltered(*map.m_impl->map, to_bridge(surface))})); });
 }
 
 Evaluation Brdf::evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept {
     auto e = m_impl->brdf->evaluate(to_bridge(footprint), to_bridge(wi), to_bridge(wo));
-    return { e.value, e.pdf };
+    return {e.value, e.pdf};
 }
 
 float Brdf::value(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept {
@@ -130,8 +129,8 @@ float Brdf::pdf(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) cons
 }
 
 Sample Brdf::sample(const Footprint &footprint, const Vec3 &wi, float u1, float u2, float u3) const noexcept {
-    auto s = m_impl->brdf->sample(to_bridge(footprint), to_bridge(wi), { u1, u2, u3 });
-    return { from_bridge(s.wo), s.value, s.pdf, s.valid };
+    auto s = m_impl->brdf->sample(to_bridge(footprint), to_bridge(wi), {u1, u2, u3});
+    return {from_bridge(s.wo), s.value, s.pdf, s.valid};
 }
 
 float Brdf::ndf(const Footprint &footprint, const Vec3 &h) const noexcept {
@@ -140,7 +139,7 @@ float Brdf::ndf(const Footprint &footprint, const Vec3 &h) const noexcept {
 
 Statistics Brdf::statistics() const {
     auto s = m_impl->brdf->statistics();
-    return { std::string(s.method), s.structure_bytes, s.build_seconds, s.bins, s.masking_alpha_u, s.masking_alpha_v };
+    return {std::string(s.method), s.structure_bytes, s.build_seconds, s.bins, s.masking_alpha_u, s.masking_alpha_v};
 }
 
 } // namespace glints

@@ -98,8 +98,7 @@ struct Sample {
 class GLINTS_API NormalMap {
 public:
     /// Reads an EXR, PNG, JPEG or TIFF file. `flip_y` negates the green component.
-    static NormalMap load(const std::string &filename, Encoding encoding = Encoding::Automatic,
-                          bool flip_y = false);
+    static NormalMap load(const std::string &filename, Encoding encoding = Encoding::Automatic, bool flip_y = false);
     /// Takes `3 * width * height` components, row by row. Normals are normalised; `name` is used in errors.
     static NormalMap from_normals(const std::string &name, uint32_t width, uint32_t height,
                                   const std::vector<float> &xyz);
@@ -123,9 +122,9 @@ private:
 /// What a method built, for tables and logs.
 struct Statistics {
     std::string method;
-    uint64_t structure_bytes; ///< memory that `evaluate`, `pdf` and `sample` need
-    double build_seconds;     ///< wall time of the construction, without reading the file
-    uint32_t bins;            ///< bins per side; 0 for methods without bins
+    uint64_t structure_bytes;               ///< memory that `evaluate`, `pdf` and `sample` need
+    double build_seconds;                   ///< wall time of the construction, without reading the file
+    uint32_t bins;                          ///< bins per side; 0 for methods without bins
     float masking_alpha_u, masking_alpha_v; ///< roughness of G_x along u and v; 0 without masking
 };
 

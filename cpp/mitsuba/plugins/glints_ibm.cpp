@@ -1,0 +1,98 @@
+/*
+Glints by an inverse bin map (`glints_ibm`)
+===========================================
+
+A surface of specular flakes given by a normal map, whose reflection is filtered over each pixel's footprint:
+Atanasov et al., "A Multiscale Microfacet Model Based on Inverse Bin Mapping" (2021).
+
+Parameters that all glint BSDFs share
+-------------------------------------
+
+| Parameter              | Type          | Meaning                                                                    |
+|------------------------|---------------|----------------------------------------------------------------------------|
+| `filename`             | string        | Normal map: EXR, PNG, JPEG or TIFF, of any size, square or not. It is      |
+|                        |               | addressed as by Mitsuba's `bitmap` (repeat, nearest), and its normals live |
+|                        |               | in the local shading frame, as in `normalmap`. (Required)                  |
+| `encoding`             | string        | How a component c of the file becomes one of the normal: `unsigned`,       |
+|                        |               | n = 2c - 1; `signed`, n = c; `auto`, `signed` for floating-point files     |
+|                        |               | that hold a negative component, else `unsigned`. (Default: `auto`)         |
+| `flip_y`               | boolean       | Negates the green component, for maps with y downwards. (Default: false)   |
+| `tiles`                | float         | Repetitions of the map over one unit of uv. (Default: 1)                   |
+| `to_uv`                | transform     | 3x3 transform of uv, applied before `tiles`. (Default: identity)           |
+| `alpha`                | float         | Beckmann roughness of one flake (texel), in [0.0001, 1]. (Default: 0.01)   |
+| `material`             | string        | Conductor from Mitsuba's library, such as `Cu` or `Al`, or `none`.         |
+| `eta`, `k`             | spectrum or   | Conductor: real and imaginary part of the index of refraction. Both are    |
+|                        | texture       | needed. Instead of `material`. *Exposed*                                   |
+| `int_ior`, `ext_ior`   | float, string | Dielectric: index of refraction inside and outside, a number or a name     |
+|                        |               | known to Mitsuba. Only the reflection is modelled.                         |
+|                        |               | (Default, if the other one is given: `bk7`, `air`)                         |
+|                        |               | With none of these there is no Fresnel term: flakes reflect everything.    |
+| `specular_reflectance` | spectrum or   | Factor on the reflection. (Default: 1) *Exposed*                           |
+|                        | texture       |                                                                            |
+| `normalization`        | string        | Weight of the texels of a footprint. `projected`: their share of the       |
+|                        |               | projected area, so that the distribution of normals integrates to one      |
+|                        |               | against the cosine. `paper`: their share of the texture's area, the        |
+|                        |               | literal Eq. 5. (Default: `projected`)                                      |
+| `masking`              | string        | Shadowing and masking of the whole map, besides the flakes' own.           |
+|                        |               | `beckmann`: Smith term with the roughness of the map's slopes, anisotropic.|
+|                        |               | `none`: no such term. (Default: `beckmann`)                                |
+| `masking_alpha_u`,     | float         | Roughness of the `beckmann` masking along u and v, instead of the map's    |
+| `masking_alpha_v`      |               | own. Both are needed.                                                      |
+
+Parameters of this plugin
+-------------------------
+
+| Parameter   | Type    | Meaning                                                                                      |
+|-------------|---------|----------------------------------------------------------------------------------------------|
+| `bins`      | integer | Bins per side of the square around the projected hemisphere of normals. 0: as many as the    |
+|             |         | flakes' roughness asks for. (Default: 0)                                                     |
+| `leaf_size` | integer | Most texels in a leaf of the forest over the map. Larger: less memory, slower evaluation. 0: |
+|             |         | the paper's 10. (Default: 0)                                                                 |
+
+Guidance
+--------
+
+- `alpha` is the roughness of a single flake, not of the surface: that comes from the map. 0.0025 gives hard, sparse
+  glints, 0.16 a smooth look with hardly any. Half of it asks for four times the bins.
+- The footprint comes from ray differentials. Render with `glints_path` (of this package) or with `direct`: Mitsuba's
+  other integrators drop the differentials, and the BSDF then shows single texels and says so once.
+- With many samples per pixel Mitsuba shrinks the footprint to that of one sample; see `footprint` of `glints_path`.
+- Deeper vertices of a path have no footprint: a glinting surface seen in a mirror shows single texels.
+- The mesh needs uv coordinates, best without strong distortion: the tangent frame of the map follows them.
+- One-sided, like `roughconductor`: wrap it in `twosided` if both sides are seen.
+- In polarized variants the reflection depolarises.
+- Variants: `scalar_rgb`, `scalar_spectral`, `scalar_spectral_polarized`.
+
+XML:
+
+    <bsdf type="glints_ibm">
+        <string name="filename" value="flakes.exr"/>
+        <float name="alpha" value="0.007"/>
+        <float name="tiles" value="8"/>
+        <string name="material" value="Al"/>
+    </bsdf>
+
+Python:
+
+    import mitsuba as mi, mitsuba_glints
+    bsdf = mi.load_dict({
+        'type': 'glints_ibm',
+        'filename': 'flakes.exr',
+        'alpha': 0.007,
+        'tiles': 8,
+        'material': 'Al',
+    })
+*/
+#include "registry.h"
+
+static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::NormalMap &map,
+                              const glints::SurfaceOptions &surface) {
+    glints::InverseBinMapOptions options;
+    options.bins = glints_mitsuba::unsigned_parameter(props, "bins", 0);
+    options.leaf_size = glints_mitsuba::unsigned_parameter(props, "leaf_size", 0);
+    return glints::Brdf::inverse_bin_map(map, surface, options);
+}
+
+extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {
+    glints_mitsuba::register_bsdf(name, fn, {make_brdf, glints_mitsuba::Footprints::Used});
+}

@@ -1,0 +1,41 @@
+// What a plugin file needs: hand its method to the one BSDF class that all glint plugins share.
+//
+// A plugin file knows Mitsuba's `Properties` and one constructor of the C++ API. It is not a template, includes no
+// BSDF header and compiles in a few seconds.
+#pragma once
+
+#include <glints/glints.h>
+#include <mitsuba/core/properties.h>
+#include <string_view>
+
+// GCC and Clang: visible both when building libglints_mitsuba.so and when using it.
+#define GLINTS_MITSUBA_API __attribute__((visibility("default")))
+
+namespace glints_mitsuba {
+
+/// Builds the BRDF of one method. Reads the plugin's own parameters; the common ones are in `surface` already.
+using BrdfFactory = glints::Brdf (*)(const mitsuba::Properties &props, const glints::NormalMap &map,
+                                     const glints::SurfaceOptions &surface);
+
+/// Does a method look at more than the centre of the footprint?
+enum class Footprints { Used, Ignored };
+
+struct Method {
+    BrdfFactory make_brdf;
+    Footprints footprints;
+};
+
+/// Offers a BSDF plugin to Mitsuba in all supported variants. Called by the plugin's `init_plugin`.
+GLINTS_MITSUBA_API void register_bsdf(std::string_view name, mitsuba::PluginRegisterFn fn, const Method &method);
+
+/// The method registered under a plugin's name.
+Method find_method(std::string_view name);
+
+/// Makes every variant that is not supported answer with an error that says which ones are.
+GLINTS_MITSUBA_API void refuse_other_variants(std::string_view name, mitsuba::PluginRegisterFn fn,
+                                              mitsuba::ObjectType type);
+
+/// A whole, non-negative parameter; `fallback` if it is absent.
+GLINTS_MITSUBA_API uint32_t unsigned_parameter(const mitsuba::Properties &props, const char *name, uint32_t fallback);
+
+} // namespace glints_mitsuba
