@@ -1,9 +1,10 @@
-//! The whole FFI surface between the Rust library and C++; C++ programs use `cpp/include/glints/glints.h`, which wraps it.
+//! The whole FFI surface between the Rust library and C++; C++ programs use `cpp/include/glints/glints.h`,
+//! which wraps it.
 //!
 //! # Invariants
 //!
-//! * Errors cross as `Result`, which cxx turns into exceptions. Constructors run inside [`guarded`], so that not even a panic aborts
-//!   the host: it becomes an error, too.
+//! * Errors cross as `Result`, which cxx turns into exceptions. Constructors run inside [`guarded`], so that
+//!   not even a panic aborts the host: it becomes an error, too.
 //! * Evaluation is total and free of panics; it takes plain values and a shared reference, from any thread.
 //! * This crate has no unsafe code of its own.
 
@@ -280,7 +281,8 @@ fn to_ffi(v: Vec3) -> ffi::Vector {
     }
 }
 
-/// Runs a constructor; a panic, which would abort the host on its way through C++, becomes an error about `name`.
+/// Runs a constructor; a panic, which would abort the host on its way through C++, becomes an error about
+/// `name`.
 fn guarded<T>(name: &'static str, value: &str, construct: impl FnOnce() -> Result<T>) -> Result<T> {
     catch_unwind(AssertUnwindSafe(construct)).unwrap_or_else(|panic| {
         let text = panic

@@ -1,5 +1,5 @@
-//! Memory, build time, query cost and error of the methods on one map, one JSON object a line:
-//! `{"name", "value", "unit", "baseline", "baseline_value", "ratio", "params"}` in bytes, seconds and nanoseconds.
+//! Memory, build time, query cost and error of the methods on one map, one JSON object a line: `{"name",
+//! "value", "unit", "baseline", "baseline_value", "ratio", "params"}` in bytes, seconds and nanoseconds.
 //!
 //! ```text
 //! cargo run --release -p glints --example bench -- --map isotropic.exr --label isotropic --alpha 0.00707
@@ -139,7 +139,8 @@ struct Query {
     u: [f32; 3],
 }
 
-/// Footprints of `width x width` texels, turned, all over the map, with directions drawn from the BRDF, so that glints are hit.
+/// Footprints of `width x width` texels, turned, all over the map, with directions drawn from the BRDF, so
+/// that glints are hit.
 fn queries(brdf: &Brdf, width: f64, count: usize) -> Vec<Query> {
     let mut random = Random(7);
     let mut queries = Vec::with_capacity(count);
@@ -195,8 +196,9 @@ fn nanoseconds(queries: &[Query], seconds: f64, call: impl Fn(&Query) -> f32) ->
     1e9 * least
 }
 
-/// Relative L1 error of the distribution of normals, the integral of `|D - D_direct| cos` (that of `D_direct cos` being one), averaged
-/// over footprints. Half the points are drawn from each of the two: what only one of them covers must count, too.
+/// Relative L1 error of the distribution of normals, the integral of `|D - D_direct| cos` (that of `D_direct
+/// cos` being one), averaged over footprints. Half the points are drawn from each of the two: what only one
+/// of them covers must count, too.
 fn ndf_error(method: &dyn Method, direct: &Direct, width: f64) -> f64 {
     const FOOTPRINTS: usize = 16;
     let points = (4096.0 / (width * width)).clamp(2.0, 64.0) as usize;

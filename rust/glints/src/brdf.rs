@@ -1,7 +1,8 @@
 //! A BRDF without Fresnel term and colour: one method, the whole map's shadowing, reflection at half vectors.
 //!
-//! `value = G_x(i, o) R(i, o) / (4 (i . n))` is `f cos theta_o` of Eq. 11 (Atanasov et al. 2021) with `F = 1`, where `i` points to the
-//! viewer (`wi`) and `o` to the light (`wo`); the density of `wo` is that of the half vector over `4 (o . h)`.
+//! `value = G_x(i, o) R(i, o) / (4 (i . n))` is `f cos theta_o` of Eq. 11 (Atanasov et al. 2021) with `F =
+//! 1`, where `i` points to the viewer (`wi`) and `o` to the light (`wo`); the density of `wo` is that of the
+//! half vector over `4 (o . h)`.
 
 use glam::Vec3;
 
@@ -24,8 +25,9 @@ pub enum Masking {
     Explicit { alpha_u: f32, alpha_v: f32 },
 }
 
-/// Smith's `G1` of an anisotropic Beckmann surface. The quadratic form is `alpha(phi)^2 sin^2 theta` for a direction with
-/// azimuth phi, and `alpha(phi)^2` is twice the variance of the slopes along it (Heitz 2014, Section 5.3).
+/// Smith's `G1` of an anisotropic Beckmann surface. The quadratic form is `alpha(phi)^2 sin^2 theta` for a
+/// direction with azimuth phi, and `alpha(phi)^2` is twice the variance of the slopes along it (Heitz 2014,
+/// Section 5.3).
 #[derive(Clone, Copy, Debug)]
 struct SmithMasking {
     xx: f32,
@@ -172,10 +174,10 @@ impl Brdf {
 
 /// Four uniform numbers from the three that renderers hand to a BSDF.
 ///
-/// The flake's normal is drawn with the caller's second and third number as they are, so that a stratified sampler
-/// keeps its stratification over the lobe. The point of the footprint comes from a 64-bit hash (the finaliser of SplitMix64) of all
-/// bits of the three numbers: it changes with each of them, is independent of the lobe's number for a given one through the
-/// first number, and has no structure that an image could show.
+/// The flake's normal is drawn with the caller's second and third number as they are, so that a stratified
+/// sampler keeps its stratification over the lobe. The point of the footprint comes from a 64-bit hash (the
+/// finaliser of SplitMix64) of all bits of the three numbers: it changes with each of them, is independent of
+/// the lobe's number for a given one through the first number, and has no structure that an image could show.
 fn four_uniforms([u1, u2, u3]: [f32; 3]) -> [f32; 4] {
     let word = |u: f32| u64::from(u.to_bits());
     let mut z = word(u1)

@@ -10,8 +10,8 @@ use crate::microfacet::Flake;
 /// How the texels of a footprint are weighted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Normalization {
-    /// Every texel covers its share of the *projected* area, `w_k / (t_k . n)`: the distribution of normals integrates
-    /// to one against the cosine, as in Yan et al. 2016.
+    /// Every texel covers its share of the *projected* area, `w_k / (t_k . n)`: the distribution of normals
+    /// integrates to one against the cosine, as in Yan et al. 2016.
     #[default]
     Projected,
     /// The literal Eq. 5: every texel is weighted with its share of the texture's area.

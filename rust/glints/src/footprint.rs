@@ -1,26 +1,29 @@
-//! The pixel footprint A in texel space, and exact areas of its intersections (Eq. 12 of Atanasov et al. 2021).
+//! The pixel footprint A in texel space, and exact areas of its intersections (Eq. 12 of Atanasov et al.
+//! 2021).
 //!
-//! A footprint is the parallelogram of the ray differentials, `A = { c + s a + t b : |s|, |t| <= 1/2 }`, with the
-//! centre `c` and the edges `a`, `b` in texels. Its indicator is the product of two slab tests,
+//! A footprint is the parallelogram of the ray differentials, `A = { c + s a + t b : |s|, |t| <= 1/2 }`, with
+//! the centre `c` and the edges `a`, `b` in texels. Its indicator is the product of two slab tests,
 //!
 //! ```text
 //! s(p) = (p - c) x b / (a x b),    t(p) = a x (p - c) / (a x b),    p in A  <=>  |s(p)| <= 1/2 and |t(p)| <= 1/2,
 //! ```
 //!
-//! so that an axis-aligned box with half extents `e` is outside, inside or cut by comparing `|s|`, `|t|` at its centre
-//! with `1/2 +- (|ds/dx| e.x + |ds/dy| e.y)`. A box cut by one slab only, by far the most frequent case, has a closed
-//! form for its area; the rest is clipped as a polygon. Both are exact up to double precision.
+//! so that an axis-aligned box with half extents `e` is outside, inside or cut by comparing `|s|`, `|t|` at
+//! its centre with `1/2 +- (|ds/dx| e.x + |ds/dy| e.y)`. A box cut by one slab only, by far the most frequent
+//! case, has a closed form for its area; the rest is clipped as a polygon. Both are exact up to double
+//! precision.
 //!
 //! Everything that a footprint can be is decided here and nowhere else:
 //!
-//! * **Tiling.** The map repeats. [`Footprint::for_each_part`] cuts A into the parts that fall into one tile each,
-//!   moved to the map's own coordinates, and counts the tiles that lie inside A entirely, so that a method answers
-//!   for those from its total histogram.
-//! * **Very large footprints.** An edge longer than [`MAX_TILES`] periods is shortened to that length: cost stays
-//!   bounded, and a box filter over that many periods of a periodic function is within 1/`MAX_TILES` of its mean.
-//! * **Degenerate footprints.** Two zero edges make a point: the texel under the centre has weight one. Parallel edges,
-//!   or one zero edge, make a parallelogram that is [`MIN_THICKNESS`] texels thick (a thousandth of its length, if that
-//!   is less), practically its limit.
+//! * **Tiling.** The map repeats. [`Footprint::for_each_part`] cuts A into the parts that fall into one tile
+//!   each, moved to the map's own coordinates, and counts the tiles that lie inside A entirely, so that a
+//!   method answers for those from its total histogram.
+//! * **Very large footprints.** An edge longer than [`MAX_TILES`] periods is shortened to that length: cost
+//!   stays bounded, and a box filter over that many periods of a periodic function is within 1/`MAX_TILES` of
+//!   its mean.
+//! * **Degenerate footprints.** Two zero edges make a point: the texel under the centre has weight one.
+//!   Parallel edges, or one zero edge, make a parallelogram that is [`MIN_THICKNESS`] texels thick (a
+//!   thousandth of its length, if that is less), practically its limit.
 //! * **Invalid differentials** (infinite or NaN) count as zero edges.
 
 use glam::DVec2;
@@ -82,8 +85,8 @@ pub struct Span {
 }
 
 impl Footprint {
-    /// The footprint at texture coordinates `uv` (in periods, any finite value) with the partial derivatives of `uv`
-    /// along the pixel's two axes, over a map of `width x height` texels.
+    /// The footprint at texture coordinates `uv` (in periods, any finite value) with the partial derivatives
+    /// of `uv` along the pixel's two axes, over a map of `width x height` texels.
     ///
     /// The texel under `uv` is found in single precision exactly as nearest lookup with repetition finds it
     /// in renderers: `floor(u * width) mod width`.
@@ -127,7 +130,8 @@ impl Footprint {
         self.region.as_ref()
     }
 
-    /// Calls `visit` with every part of the footprint. Weights of texels are areas divided by [`Footprint::area`].
+    /// Calls `visit` with every part of the footprint. Weights of texels are areas divided by
+    /// [`Footprint::area`].
     pub fn for_each_part(&self, mut visit: impl FnMut(Part)) {
         let Some(region) = &self.region else {
             let (column, row) = self.texel;
@@ -157,7 +161,8 @@ impl Footprint {
         self.region.map_or(1.0, |r| r.area)
     }
 
-    /// The texel at a uniformly distributed point of the footprint: it is drawn with its weight as probability.
+    /// The texel at a uniformly distributed point of the footprint: it is drawn with its weight as
+    /// probability.
     pub fn sample_texel(&self, u: [f64; 2]) -> (u32, u32) {
         let Some(region) = &self.region else {
             return self.texel;
@@ -232,8 +237,8 @@ impl Parallelogram {
             .map(|g| (g.dot(d), g.x.abs() * e.x + g.y.abs() * e.y))
     }
 
-    /// How the box `[low, high]` lies to the parallelogram. `Cut` may be answered for a box that is just outside
-    /// one of the acute corners; its overlap is then zero.
+    /// How the box `[low, high]` lies to the parallelogram. `Cut` may be answered for a box that is just
+    /// outside one of the acute corners; its overlap is then zero.
     pub fn coverage(&self, low: DVec2, high: DVec2) -> Coverage {
         let slabs = self.slabs(low, high);
         if slabs.iter().all(|(s, r)| s.abs() + r <= 0.5) {
@@ -318,8 +323,8 @@ impl Parallelogram {
     }
 }
 
-/// The cells of each row of a grid that a parallelogram touches or holds. Along a row, a slab `|s| <= bound` is an interval of
-/// the cells' centres whose middle moves linearly from row to row.
+/// The cells of each row of a grid that a parallelogram touches or holds. Along a row, a slab `|s| <= bound`
+/// is an interval of the cells' centres whose middle moves linearly from row to row.
 struct Rows {
     center: DVec2,
     half_width: f64,
@@ -331,7 +336,8 @@ struct Rows {
 /// Interval `shift * y +- half` of x from the parallelogram's centre, in the row whose middle is y above it.
 struct RowSlab {
     shift: f64,
-    /// Half of the interval in which a cell may touch the slab, and in which it lies inside; negative: nowhere.
+    /// Half of the interval in which a cell may touch the slab, and in which it lies inside; negative:
+    /// nowhere.
     touched: f64,
     inside: f64,
 }
@@ -339,7 +345,8 @@ struct RowSlab {
 impl Rows {
     fn new(region: &Parallelogram, cell: DVec2) -> Self {
         let slabs = region.gradients.map(|g| {
-            // A slab along the rows holds all of a row or nothing: so does one that is tilted by next to nothing.
+            // A slab along the rows holds all of a row or nothing: so does one that is tilted by next to
+            // nothing.
             let gx = if g.x == 0.0 { 1e-100 } else { g.x };
             let variation = 0.5 * (g.x.abs() * cell.x + g.y.abs() * cell.y);
             RowSlab {
@@ -369,8 +376,8 @@ impl Rows {
             inside.0 = inside.0.max(middle - slab.inside);
             inside.1 = inside.1.min(middle + slab.inside);
         }
-        // Cell k has its centre at (k + 1/2) cell widths. A cell within rounding error of the boundary is left to the
-        // exact overlap.
+        // Cell k has its centre at (k + 1/2) cell widths. A cell within rounding error of the boundary is
+        // left to the exact overlap.
         let cell_at = |x: f64| (self.center.x + x) * self.inv_cell_width - 0.5;
         let start = cell_at(touched.0).floor() as i64;
         let end = (cell_at(touched.1).ceil() as i64 + 1).max(start);
@@ -384,8 +391,8 @@ impl Rows {
     }
 }
 
-/// Fraction of a box inside the slab |s| <= 1/2, with s = `center` at the box's centre and `range` its change over
-/// the box's width and height.
+/// Fraction of a box inside the slab |s| <= 1/2, with s = `center` at the box's centre and `range` its change
+/// over the box's width and height.
 fn slab_fraction(range: DVec2, center: f64) -> f64 {
     let below = |bound: f64| fraction_below(range.abs() * 0.5, bound - center);
     below(0.5) - below(-0.5)
@@ -466,7 +473,8 @@ mod tests {
     use approx::assert_relative_eq;
     use proptest::prelude::*;
 
-    /// Area of the box `[low, high]` inside the parallelogram, clipped the other way round: the box by the slabs.
+    /// Area of the box `[low, high]` inside the parallelogram, clipped the other way round: the box by the
+    /// slabs.
     fn reference_overlap(region: &Parallelogram, low: DVec2, high: DVec2) -> f64 {
         let [a, b] = region.edges;
         let c = region.center;

@@ -22,7 +22,8 @@ impl DirectionPair {
         above.then_some(Self { wi, wo, half })
     }
 
-    /// The pair that reflects `wi` at the normal `half`; `None` if `wi` or the reflection is not above both horizons.
+    /// The pair that reflects `wi` at the normal `half`; `None` if `wi` or the reflection is not above both
+    /// horizons.
     #[inline]
     pub fn reflected(wi: Vec3, half: Vec3) -> Option<Self> {
         let cos = wi.dot(half);

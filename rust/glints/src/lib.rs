@@ -1,11 +1,13 @@
 //! Filtered distributions of normals for specular microstructure.
 //!
 //! Data flows one way: a [`normal_map::NormalMap`] is turned into a [`methods::Method`]'s structure, a
-//! [`footprint::Footprint`] and a half vector query it, and [`brdf::Brdf`] turns the answer into a BRDF value, a sample or a density,
-//! without Fresnel term and colour. The library knows no renderer and does no FFI.
+//! [`footprint::Footprint`] and a half vector query it, and [`brdf::Brdf`] turns the answer into a BRDF
+//! value, a sample or a density, without Fresnel term and colour. The library knows no renderer and does no
+//! FFI.
 //!
 //! Units and domains, everywhere: texels for lengths on the map (column along u, row along v, origin at the
-//! corner of texel (0, 0)); unit vectors in the local shading frame, z the shading normal; densities per solid angle.
+//! corner of texel (0, 0)); unit vectors in the local shading frame, z the shading normal; densities per
+//! solid angle.
 
 pub mod brdf;
 pub mod error;

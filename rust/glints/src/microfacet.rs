@@ -1,9 +1,10 @@
-//! The micro-BRDF of a flake: Beckmann distribution and Smith shadowing (Walter et al. 2007), about any normal.
+//! The micro-BRDF of a flake: Beckmann distribution and Smith shadowing (Walter et al. 2007), about any
+//! normal.
 //!
-//! Section 5.1 of Atanasov et al. 2021 makes the normal explicit, `D^alpha(h, t)` and `G^alpha(i, o, h, t)`, because
-//! every texel of a normal map carries its own micro-BRDF about its own normal `t`. All vectors are unit vectors in
-//! the local shading frame; `alpha` is the Beckmann roughness, the flake's slopes having the standard deviation
-//! `alpha / sqrt(2)` along each axis.
+//! Section 5.1 of Atanasov et al. 2021 makes the normal explicit, `D^alpha(h, t)` and `G^alpha(i, o, h, t)`,
+//! because every texel of a normal map carries its own micro-BRDF about its own normal `t`. All vectors are
+//! unit vectors in the local shading frame; `alpha` is the Beckmann roughness, the flake's slopes having the
+//! standard deviation `alpha / sqrt(2)` along each axis.
 
 use glam::Vec3;
 
@@ -63,7 +64,8 @@ impl Flake {
         (density, cos)
     }
 
-    /// Whether `D^alpha(h, t)` counts as zero for all of `normals`: true for nearly all blocks of a glittering map.
+    /// Whether `D^alpha(h, t)` counts as zero for all of `normals`: true for nearly all blocks of a
+    /// glittering map.
     #[inline]
     pub fn misses_all(&self, h: Vec3, normals: &[Vec3]) -> bool {
         let near = |t: &Vec3| (h - *t).length_squared() < self.max_chord2;
@@ -92,8 +94,9 @@ impl Flake {
     }
 }
 
-/// Smith's masking function of the Beckmann distribution as a function of `(alpha tan theta)^2`, in the rational
-/// approximation of Walter et al. 2007 (Section 5.2; relative error below 0.35 %), which renderers share.
+/// Smith's masking function of the Beckmann distribution as a function of `(alpha tan theta)^2`, in the
+/// rational approximation of Walter et al. 2007 (Section 5.2; relative error below 0.35 %), which renderers
+/// share.
 #[inline]
 pub fn beckmann_g1(alpha_tan2: f32) -> f32 {
     if alpha_tan2 * (1.6 * 1.6) <= 1.0 {

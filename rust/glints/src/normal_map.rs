@@ -1,9 +1,9 @@
 //! A decoded, validated normal map: the input of every method.
 //!
-//! A map is `width * height` unit normals in the local shading frame (x along u, y along v, z up), row by row,
-//! row 0 at v = 0. The texel with column `i` and row `j` covers `[i, i+1) x [j, j+1)` of texel space, and the
-//! map repeats in both directions. Interpolation is never applied: the surface is piecewise flat, one mirror
-//! (or rough flake) per texel, as in Atanasov et al. 2021, Section 3.2.
+//! A map is `width * height` unit normals in the local shading frame (x along u, y along v, z up), row by
+//! row, row 0 at v = 0. The texel with column `i` and row `j` covers `[i, i+1) x [j, j+1)` of texel space,
+//! and the map repeats in both directions. Interpolation is never applied: the surface is piecewise flat, one
+//! mirror (or rough flake) per texel, as in Atanasov et al. 2021, Section 3.2.
 //!
 //! Validation happens here, once: components are finite, lengths are not zero, and every normal points out of
 //! the surface (`z >= MIN_Z`). Methods rely on it and check nothing again.
@@ -52,7 +52,8 @@ pub struct SlopeCovariance {
 }
 
 impl NormalMap {
-    /// Reads an EXR, PNG, JPEG or TIFF file; the format is recognised by content. `flip_y` negates the y component.
+    /// Reads an EXR, PNG, JPEG or TIFF file; the format is recognised by content. `flip_y` negates the y
+    /// component.
     pub fn load(path: impl AsRef<Path>, encoding: Encoding, flip_y: bool) -> Result<Self> {
         let path = path.as_ref();
         let image = decode(path)?;

@@ -88,7 +88,8 @@ fn distributions_integrate_to_one_against_the_cosine() {
     }
 }
 
-/// Relative L1 difference of the distributions of normals over the half-vector disk, averaged over footprints.
+/// Relative L1 difference of the distributions of normals over the half-vector disk, averaged over
+/// footprints.
 fn relative_l1(method: &dyn Method, exact: &dyn Method, width: f64, turns: usize) -> f64 {
     let (mut difference, mut total) = (0.0, 0.0);
     for turn in 0..turns {
@@ -122,8 +123,8 @@ fn binned_distribution_is_near_the_direct_one() {
     }
 }
 
-/// Pearson's statistic of `method`'s half vectors over a grid of cells on the disk, against densities integrated with
-/// `oversampling^2` points a cell. Cells with fewer than ten expected hits are pooled.
+/// Pearson's statistic of `method`'s half vectors over a grid of cells on the disk, against densities
+/// integrated with `oversampling^2` points a cell. Cells with fewer than ten expected hits are pooled.
 fn chi_square(method: &dyn Method, footprint: &Footprint, cells: usize, oversampling: usize) -> (f64, f64) {
     const SAMPLES: usize = 1_000_000;
     let side = cells * oversampling;

@@ -1,11 +1,13 @@
 //! The direct sum: every texel of the footprint, exactly.
 //!
-//! **Computes** Eq. 11 and 12 of Atanasov et al. 2021, `sum_k w_k C(i, o, t_k)` with `w_k = |A n T_k| / |A|`, without bins
-//! and without truncation. It is the ground truth of every filtered estimator over the same footprint.
+//! **Computes** Eq. 11 and 12 of Atanasov et al. 2021, `sum_k w_k C(i, o, t_k)` with `w_k = |A n T_k| / |A|`,
+//! without bins and without truncation. It is the ground truth of every filtered estimator over the same
+//! footprint.
 //!
 //! **Layout** One unit normal a texel, 12 bytes.
 //!
-//! **Cost** Proportional to the texels of the footprint, at most a few periods of the map; `sample` costs O(1).
+//! **Cost** Proportional to the texels of the footprint, at most a few periods of the map; `sample` costs
+//! O(1).
 
 use glam::Vec3;
 
@@ -25,7 +27,8 @@ impl Direct {
         Self { map, model }
     }
 
-    /// Calls `visit` with normals and their common weight `w_k`, block by block, over all texels of the footprint; weights sum to one.
+    /// Calls `visit` with normals and their common weight `w_k`, block by block, over all texels of the
+    /// footprint; weights sum to one.
     pub fn for_each_block(&self, footprint: &Footprint, mut visit: impl FnMut(&[Vec3], f32)) {
         let inv_area = 1.0 / footprint.area();
         footprint.for_each_part(|part| match part {

@@ -14,8 +14,9 @@ use crate::half_vector::DirectionPair;
 /// Fresnel term, colour and the whole map's shadowing `G_x` are the caller's; a method sees a footprint and
 /// directions above the horizon, and is total: every input has an answer.
 ///
-/// `sample` and the density of [`Method::evaluate`] are exact partners: what `sample` draws has that density per solid
-/// angle, and where `sample` gives up with some probability, the density integrates to one minus that probability.
+/// `sample` and the density of [`Method::evaluate`] are exact partners: what `sample` draws has that density
+/// per solid angle, and where `sample` gives up with some probability, the density integrates to one minus
+/// that probability.
 pub trait Method: Send + Sync {
     /// The reflection `R` and the density of `pair.half` under [`Method::sample`], both over the footprint:
     ///
@@ -32,8 +33,8 @@ pub trait Method: Send + Sync {
     /// The filtered distribution of normals `D_A(h)`, per solid angle: `R` without shadowing.
     fn ndf(&self, footprint: &Footprint, h: Vec3) -> f32;
 
-    /// Draws a half vector: `u[0..2]` choose the point of the footprint, `u[2..4]` the normal of the flake there.
-    /// `None`: the draw failed and counts as zero.
+    /// Draws a half vector: `u[0..2]` choose the point of the footprint, `u[2..4]` the normal of the flake
+    /// there. `None`: the draw failed and counts as zero.
     fn sample(&self, footprint: &Footprint, u: [f32; 4]) -> Option<Vec3>;
 
     /// Columns and rows of the map.

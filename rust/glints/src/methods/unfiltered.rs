@@ -1,8 +1,8 @@
 //! No filter: the combined BRDF of the one texel under the shading point.
 //!
-//! **Computes** Eq. 5 of Atanasov et al. 2021 at the footprint's centre, whatever the footprint. It converges to the true
-//! image with many samples per pixel, since averaging over a pixel's samples is the integral of Eq. 10; it is therefore
-//! the reference that filtered methods are held against.
+//! **Computes** Eq. 5 of Atanasov et al. 2021 at the footprint's centre, whatever the footprint. It converges
+//! to the true image with many samples per pixel, since averaging over a pixel's samples is the integral of
+//! Eq. 10; it is therefore the reference that filtered methods are held against.
 //!
 //! **Layout** One unit normal a texel, 12 bytes.
 //!

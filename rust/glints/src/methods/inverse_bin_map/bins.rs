@@ -10,8 +10,9 @@ const MAX_RESOLUTION: u32 = 16_384;
 /// Places of a neighbourhood: 5 x 5, the corners staying empty.
 pub const SLOTS: usize = 25;
 
-/// Bins per side for a flake of roughness `alpha`: `floor(5 / sin theta_0)` with `tan theta_0 = 3 alpha / sqrt 2`, so that
-/// five bins span the lobe's diameter of three standard deviations either way (Eq. 16; see the parent module for the floor).
+/// Bins per side for a flake of roughness `alpha`: `floor(5 / sin theta_0)` with `tan theta_0 = 3 alpha /
+/// sqrt 2`, so that five bins span the lobe's diameter of three standard deviations either way (Eq. 16; see
+/// the parent module for the floor).
 pub fn derived_resolution(alpha: f32) -> u32 {
     let tan = 3.0 * f64::from(alpha) / std::f64::consts::SQRT_2;
     let sin = tan / (1.0 + tan * tan).sqrt();
@@ -74,8 +75,8 @@ impl BinGrid {
         pack(self.bin(m))
     }
 
-    /// The normal `b_j` that stands for a bin: its centre, or for a bin whose centre is not on the disk the point halfway
-    /// between its corner nearest to the pole and the rim.
+    /// The normal `b_j` that stands for a bin: its centre, or for a bin whose centre is not on the disk the
+    /// point halfway between its corner nearest to the pole and the rim.
     #[inline]
     pub fn representative(&self, (column, row): Bin) -> Vec3 {
         let width = 2.0 / self.resolution as f32;
@@ -152,9 +153,10 @@ impl Neighbourhood {
 
     /// Calls `visit(slot, offset)` for every packed bin of `row` that is one of the 21.
     ///
-    /// Both coordinates of a bin are compared at once in one word: with the top bit of each half set, subtracting
-    /// the first bin never borrows, and the difference of a match has nothing but its three lowest bits in each half. Whole
-    /// blocks without a match, nearly all of them, cost a few vector instructions.
+    /// Both coordinates of a bin are compared at once in one word: with the top bit of each half set,
+    /// subtracting the first bin never borrows, and the difference of a match has nothing but its three
+    /// lowest bits in each half. Whole blocks without a match, nearly all of them, cost a few vector
+    /// instructions.
     #[inline]
     pub fn for_each_match(&self, row: &[u32], mut visit: impl FnMut(usize, usize)) {
         const TOP: u32 = 0x8000_8000;

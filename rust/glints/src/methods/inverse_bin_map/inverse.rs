@@ -1,23 +1,27 @@
-//! The inverse bin map B^-1, its index I and its forest F (Section 5.4): where are the texels of bin j inside A?
+//! The inverse bin map B^-1, its index I and its forest F (Section 5.4): where are the texels of bin j inside
+//! A?
 //!
 //! **Layout**
 //!
-//! * `texels`: indices `row * width + column` of all N texels, sorted by bin (Eq. 19), and within a bin by the order in which
-//!   the kd-tree below visits them, so that the texels of every tree node are consecutive.
+//! * `texels`: indices `row * width + column` of all N texels, sorted by bin (Eq. 19), and within a bin by
+//!   the order in which the kd-tree below visits them, so that the texels of every tree node are consecutive.
 //! * `starts`: the list of bin j is `texels[starts[j]..starts[j + 1]]`; its length is the total histogram.
-//! * Kd-trees, one for each bin of more than `leaf_size` texels. All share their splitting planes: the root is the whole map, a node
-//!   of `w x h` texels is split along its longer side (along x if they are equal) at `floor(side / 2)`, so neither planes
-//!   nor boxes are stored. A node of at most `leaf_size` texels is a leaf.
+//! * Kd-trees, one for each bin of more than `leaf_size` texels. All share their splitting planes: the root
+//!   is the whole map, a node of `w x h` texels is split along its longer side (along x if they are equal) at
+//!   `floor(side / 2)`, so neither planes nor boxes are stored. A node of at most `leaf_size` texels is a
+//!   leaf.
 //! * `forest`: inner nodes in preorder, `[texels of the left child]` or, where both children are inner nodes,
-//!   `[texels of the left child, words to the right child]`. A node's range of `texels` follows from the counts on the way
-//!   down. Words have 16 bits; a node of more than [`NARROW`] texels, of which there are few, takes two for each number.
+//!   `[texels of the left child, words to the right child]`. A node's range of `texels` follows from the
+//!   counts on the way down. Words have 16 bits; a node of more than [`NARROW`] texels, of which there are
+//!   few, takes two for each number.
 //! * `roots` and `has_tree`: the positions of the trees' roots, ranked by a bit vector over the bins.
 //!
-//! **Construction** One counting sort by bin that visits the texels in kd order: every list comes out sorted, whatever the
-//! number of threads. The trees are then read off the lists by binary search. Time O(N log N) with a small constant, memory the result plus one counter a bin.
+//! **Construction** One counting sort by bin that visits the texels in kd order: every list comes out sorted,
+//! whatever the number of threads. The trees are then read off the lists by binary search. Time O(N log N)
+//! with a small constant, memory the result plus one counter a bin.
 //!
-//! **Query** All bins of a neighbourhood descend together, so each node's box meets the footprint once. A node inside the footprint
-//! contributes its count; only cut leaves look at texels.
+//! **Query** All bins of a neighbourhood descend together, so each node's box meets the footprint once. A
+//! node inside the footprint contributes its count; only cut leaves look at texels.
 
 use std::ops::Range;
 
@@ -39,8 +43,8 @@ pub struct InverseMap {
     forest: Vec<u16>,
 }
 
-/// Most texels of a node whose numbers take one word. Its tree has at most 32 levels (sides of 16 bits), each with at most
-/// half as many inner nodes as texels, of at most two words: distances stay below 2^16.
+/// Most texels of a node whose numbers take one word. Its tree has at most 32 levels (sides of 16 bits), each
+/// with at most half as many inner nodes as texels, of at most two words: distances stay below 2^16.
 const NARROW: u32 = 2047;
 
 /// A rectangle of texels: a node of every tree.
@@ -52,7 +56,8 @@ struct Cell {
     height: u32,
 }
 
-/// The texels of one bin inside a cell: a range of `texels`, and the position of the node if it is an inner one.
+/// The texels of one bin inside a cell: a range of `texels`, and the position of the node if it is an inner
+/// one.
 #[derive(Clone, Copy)]
 struct Node {
     slot: u32,
@@ -207,7 +212,8 @@ impl InverseMap {
         )
     }
 
-    /// Builds the trees of all bins; each row of bins independently, so that the result does not depend on the threads.
+    /// Builds the trees of all bins; each row of bins independently, so that the result does not depend on
+    /// the threads.
     fn grow_forest(&mut self) {
         let rows: Vec<(Vec<u32>, Vec<u16>)> = (0..self.resolution)
             .into_par_iter()
@@ -279,8 +285,8 @@ fn list_starts(bins: impl Iterator<Item = usize>, resolution: u32) -> Vec<u32> {
     starts
 }
 
-/// The texels sorted by bin, and within a bin in the order of the trees. Every thread goes through all texels and keeps
-/// those of its own range of bins.
+/// The texels sorted by bin, and within a bin in the order of the trees. Every thread goes through all texels
+/// and keeps those of its own range of bins.
 fn sorted_texels(starts: &[u32], size: (u32, u32), bin_of: impl Fn(u32) -> usize + Sync) -> Vec<u32> {
     let mut texels = vec![0; *starts.last().unwrap_or(&0) as usize];
     let mut rest = texels.as_mut_slice();

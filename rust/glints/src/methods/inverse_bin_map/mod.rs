@@ -1,11 +1,12 @@
-//! Inverse bin maps: filtering a normal map with flake roughness at a cost that does not grow with the footprint's area.
+//! Inverse bin maps: filtering a normal map with flake roughness at a cost that does not grow with the
+//! footprint's area.
 //!
-//! **Source** Atanasov, Wilkie, Koylazov, Křivánek: *A Multiscale Microfacet Model Based on Inverse Bin Mapping*,
-//! Eurographics 2021, Sections 4.2 and 5.
+//! **Source** Atanasov, Wilkie, Koylazov, Křivánek: *A Multiscale Microfacet Model Based on Inverse Bin
+//! Mapping*, Eurographics 2021, Sections 4.2 and 5.
 //!
-//! **Computes** The binned BRDF of Eq. 15. The projected hemisphere is cut into `b x b` square bins; all texels whose normal
-//! falls into bin j share the bin's representative normal `b_j`, and the sum over texels becomes a sum over the 21 bins
-//! around the half vector,
+//! **Computes** The binned BRDF of Eq. 15. The projected hemisphere is cut into `b x b` square bins; all
+//! texels whose normal falls into bin j share the bin's representative normal `b_j`, and the sum over texels
+//! becomes a sum over the 21 bins around the half vector,
 //!
 //! ```text
 //! R(i, o) = sum_{j in N(beta(h))} W_j g_j D^alpha(h, b_j) G1(i, b_j) G1(o, b_j) [/ (b_j . n)],   W_j = sum_{t_k in H_j} w_k.
@@ -13,15 +14,16 @@
 //!
 //! **Where it departs from the printed paper**
 //!
-//! * *Bins per side.* `b = floor(5 / sin theta_0)`, `theta_0 = atan(3 alpha / sqrt 2)`: Eq. 16 prints a ceiling, Table 4
-//!   (942, 235, 59, 15) was made with the floor.
-//! * *Density.* Eq. 18 lacks the cosine of the sampled microfacet and the truncation. Here a sample whose normal `m`, drawn about
-//!   `b_j`, leaves the neighbourhood (`j` not in `N(beta(m))`) fails, and
-//!   `p(h) = sum_{j in N(beta(h))} W_j D^alpha(h, b_j) (h . b_j)`: exact partners, the density integrating to one minus the
-//!   probability of failure (about 1 %).
-//! * *Gain.* The truncation would darken the image by that percent. `g_j = 1 / (mass of the lobe inside its 21 bins)` puts the energy
-//!   back, so that the distribution of normals integrates to one ([`LobeGain`]).
-//! * *Rim.* A bin whose centre lies outside the unit disk is represented by a point between its innermost corner and the disk's rim.
+//! * *Bins per side.* `b = floor(5 / sin theta_0)`, `theta_0 = atan(3 alpha / sqrt 2)`: Eq. 16 prints a
+//!   ceiling, Table 4 (942, 235, 59, 15) was made with the floor.
+//! * *Density.* Eq. 18 lacks the cosine of the sampled microfacet and the truncation. Here a sample whose
+//!   normal `m`, drawn about `b_j`, leaves the neighbourhood (`j` not in `N(beta(m))`) fails, and `p(h) =
+//!   sum_{j in N(beta(h))} W_j D^alpha(h, b_j) (h . b_j)`: exact partners, the density integrating to one
+//!   minus the probability of failure (about 1 %).
+//! * *Gain.* The truncation would darken the image by that percent. `g_j = 1 / (mass of the lobe inside its
+//!   21 bins)` puts the energy back, so that the distribution of normals integrates to one ([`LobeGain`]).
+//! * *Rim.* A bin whose centre lies outside the unit disk is represented by a point between its innermost
+//!   corner and the disk's rim.
 //!
 //! **Layout**, for N texels and b^2 bins:
 //!
@@ -29,10 +31,10 @@
 //! |---|---|---|
 //! | bin map, `by << 16 \| bx` per texel, row by row | B | 4 N |
 //! | inverse bin map and its index ([`inverse::InverseMap`]) | B^-1, I | 4 N + 4.2 b^2 |
-//! | forest | F | about 1.3 words per leaf of at most `leaf_size` texels |
+//! | forest | F | about 3 bytes per leaf of at most `leaf_size` texels |
 //!
-//! **Bounds** A query costs O(perimeter) in the forest. A small footprint is answered by scanning the bin map instead
-//! ([`SCAN_FACTOR`]), which yields the same weights at about a nanosecond a texel.
+//! **Bounds** A query costs O(perimeter) in the forest. A small footprint is answered by scanning the bin map
+//! instead ([`SCAN_FACTOR`]), which yields the same weights at about a nanosecond a texel.
 
 pub mod bins;
 pub mod inverse;
@@ -52,9 +54,9 @@ use inverse::InverseMap;
 /// The paper's leaf size L (Section 5.4).
 pub const LEAF_SIZE: u32 = 10;
 
-/// A footprint of fewer than `SCAN_FACTOR n^(1/4)` texels is answered from the bin map, where n is the number of texels in the 21 bins:
-/// the measured crossover with the forest on 2K maps, isotropic and brushed, for alpha from 0.0025 (1000 texels) to 0.16
-/// (10 000 texels).
+/// A footprint of fewer than `SCAN_FACTOR n^(1/4)` texels is answered from the bin map, where n is the number
+/// of texels in the 21 bins: the measured crossover with the forest on 2K maps, isotropic and brushed, for
+/// alpha from 0.0025 (1000 texels) to 0.16 (10 000 texels).
 const SCAN_FACTOR: f64 = 375.0;
 
 /// Parameters with the paper's defaults.
@@ -114,7 +116,8 @@ impl InverseBinMap {
         &self.grid
     }
 
-    /// The weights `W_j` of the bins around `h`, summing to at most one; zero for bins outside the neighbourhood.
+    /// The weights `W_j` of the bins around `h`, summing to at most one; zero for bins outside the
+    /// neighbourhood.
     pub fn bin_weights(&self, footprint: &Footprint, h: Vec3) -> (Neighbourhood, [f32; SLOTS]) {
         let neighbourhood = self.grid.neighbourhood(h);
         let mut areas = [0.0; SLOTS];
@@ -170,7 +173,8 @@ impl InverseBinMap {
         }
     }
 
-    /// Calls `visit` with the representative normal, the weight and the gain of every bin around `h` that the footprint holds.
+    /// Calls `visit` with the representative normal, the weight and the gain of every bin around `h` that the
+    /// footprint holds.
     #[inline]
     fn for_each_lobe(&self, footprint: &Footprint, h: Vec3, mut visit: impl FnMut(Vec3, f32, f32)) {
         let (neighbourhood, weights) = self.bin_weights(footprint, h);
@@ -235,11 +239,12 @@ impl Method for InverseBinMap {
     }
 }
 
-/// `g_j = 1 / mass_j`, with `mass_j` the mass of the Beckmann lobe about `b_j` inside the 21 bins around bin j.
+/// `g_j = 1 / mass_j`, with `mass_j` the mass of the Beckmann lobe about `b_j` inside the 21 bins around bin
+/// j.
 ///
-/// The mass depends on the tilt of `b_j`, because projection onto the disk narrows the lobe radially by `cos theta`, and hardly
-/// on its azimuth. It grows from 0.9898 at the pole (three standard deviations either way, without corners) to 1, so a
-/// table over the radius, averaged over azimuths, is accurate to about 1e-3.
+/// The mass depends on the tilt of `b_j`, because projection onto the disk narrows the lobe radially by `cos
+/// theta`, and hardly on its azimuth. It grows from 0.9898 at the pole (three standard deviations either way,
+/// without corners) to 1, so a table over the radius, averaged over azimuths, is accurate to about 1e-3.
 struct LobeGain {
     by_radius: Vec<f32>,
 }
@@ -272,9 +277,10 @@ impl LobeGain {
     }
 }
 
-/// Mass of a lobe inside the 21 bins of side `bin_width` around its own, for a lobe tilted to `radius` on the disk, `azimuth` from
-/// the grid's x axis: `D^alpha cos` over offsets on the disk, whose radial part is stretched by `1 / cos theta` into the
-/// lobe's own tangent plane (first order in the offset; the horizon is ignored, as it cuts the exact lobe alike).
+/// Mass of a lobe inside the 21 bins of side `bin_width` around its own, for a lobe tilted to `radius` on the
+/// disk, `azimuth` from the grid's x axis: `D^alpha cos` over offsets on the disk, whose radial part is
+/// stretched by `1 / cos theta` into the lobe's own tangent plane (first order in the offset; the horizon is
+/// ignored, as it cuts the exact lobe alike).
 fn lobe_mass(bin_width: f64, alpha: f64, radius: f64, azimuth: f64) -> f64 {
     // Gauss-Legendre nodes and weights on [-1/2, 1/2]; a bin is 1.2 standard deviations wide.
     const RULE: [(f64, f64); 4] = [
