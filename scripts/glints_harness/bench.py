@@ -1,0 +1,341 @@
+"""Command line of `scripts/bench`: memory and speed of the methods, against each other and stock Mitsuba, in one run.
+
+Three sources: the Rust library's own benchmark (structures and queries), a C++ timer (the same queries through
+Mitsuba's BSDF interface, beside stock `roughconductor`), and whole frames.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import time
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from . import provenance, render, timer
+from .cli import ROOT, number, scene_assets
+from .files import write_json
+from .methods import METHODS
+from .progress import Display, console
+from .render import Lighting, LoadedScene
+from .scenes import FULL_SIZE, find_scenes
+
+ALPHA = 0.00707
+"""Flake roughness of the paper's Figure 7."""
+
+WIDTHS = (1, 4, 16, 64, 256, 1024)
+"""Footprint widths in texels."""
+
+FRAME_SPP = 16
+
+FRAMES = (
+    # method, tiling
+    ("roughconductor", 1),
+    ("normalmap", 1),
+    ("normalmap", 8),
+    ("glints_ibm", 1),
+    ("glints_ibm", 8),
+    ("glints_direct", 1),
+    ("glints_direct", 8),
+)
+
+GRID = 128
+"""Pixels a side of the grid that the share of glinting pixels is counted on."""
+
+LONGEST_FRAME = 120.0
+"""Seconds; a frame that is predicted to take longer is left out, and one of a third of this is rendered once."""
+
+
+def target(record):
+    """(text, whether reached) of the target for a record, or None if there is none."""
+    name, value, ratio, params = (record[key] for key in ("name", "value", "ratio", "params"))
+    if name == "ibm/memory":
+        return "at most the paper's", ratio <= 1
+    if name == "ibm/build":
+        return "at most 0.3 s", value <= 0.3
+    if name == "ibm/three_calls" and "scene" in params:
+        return "at most 10 µs", value <= 10_000
+    full = params.get("resolution") == FULL_SIZE
+    if name == "frame" and full and params["method"] == "glints_ibm" and record["baseline"].startswith("normalmap"):
+        return "at most 2×", ratio <= 2
+    return None
+
+
+def make_record(name, value, unit, baseline, baseline_value, params):
+    """A line of bench.json."""
+    return {
+        "name": name,
+        "value": value,
+        "unit": unit,
+        "baseline": baseline,
+        "baseline_value": baseline_value,
+        "ratio": value / baseline_value,
+        "params": params,
+    }
+
+
+def rust_records(maps, quick, say):
+    """The records of the Rust library's benchmark program, on every map."""
+    records = []
+    for label, path in maps.items():
+        say(f"Rust library on the {label} map")
+        options = ["--alpha", str(ALPHA), "--width", "1,16,256", "--seconds", "0.01"] if quick else []
+        records += run_rust(path, label, options)
+    return records
+
+
+def scene_records(scenes, say):
+    """The three calls of one sample at each scene's own footprint: the median pixel's, as at 1 sample per pixel."""
+    records = []
+    for scene in scenes:
+        say(f"Rust library at the footprint of {scene.name}")
+        loaded = LoadedScene(scene.text(METHODS["roughconductor"], 1))
+        view = scene.views(FULL_SIZE, FULL_SIZE)["frame"]
+        width = statistics.median(loaded.glinting_pixels(scene.first_slot().element.get("id"), view))
+        texels = width * scene.base_tiles * timer.texels_per_side(scene.normal_map)
+        for tiling in (1, 8):
+            options = ["--alpha", str(scene.alpha), "--width", f"{texels * tiling:.4g}"]
+            for record in run_rust(scene.normal_map, scene.normal_map.stem, options):
+                if record["name"] == "ibm/three_calls":
+                    record["params"].update(scene=scene.name, tiling=tiling)
+                    records.append(record)
+    return records
+
+
+def run_rust(path, label, options):
+    """Run the Rust library's benchmark program on a map; returns its records."""
+    command = ["cargo", "run", "--release", "--locked", "--quiet", "--package", "glints", "--example", "bench", "--"]
+    command += ["--map", str(path), "--label", label, *options]
+    # The flags and the folder of the build, see scripts/test.
+    flags = {"RUSTFLAGS": "-C target-cpu=x86-64-v3", "CARGO_TARGET_DIR": str(ROOT / "build" / "cargo")}
+    done = subprocess.run(
+        command, cwd=ROOT, env={**os.environ, **flags}, stdout=subprocess.PIPE, text=True, check=True
+    )
+    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+
+
+def plugin_records(maps, quick, say):
+    """The cost of single calls through Mitsuba's interface, against one evaluation of stock `roughconductor`."""
+    import mitsuba as mi
+
+    measure = timer.load()
+    stock = mi.load_dict({"type": "roughconductor", "distribution": "beckmann", "alpha": ALPHA})
+    records = []
+    for label, path in maps.items():
+        side = timer.texels_per_side(path)
+        for plugin, short in (("glints_ibm", "ibm"), ("glints_direct", "direct")):
+            say(f"{plugin} on the {label} map")
+            bsdf = timer.glint_bsdf(plugin, path, ALPHA)
+            for width in WIDTHS[::2] if quick else WIDTHS:
+                interactions = max(32, min(4096, 2_000_000 // width**2)) if short == "direct" else 4096
+                plain = measure(stock, 0.0, 4096).eval_ns
+                timings = measure(bsdf, width / side, interactions, 1 if quick else 3)
+                params = {"map": label, "alpha": ALPHA, "footprint": width, "through": "Mitsuba"}
+                calls = ("eval",) if short == "direct" else ("eval", "sample", "pdf")
+                records += [
+                    make_record(
+                        f"{short}/{call}",
+                        getattr(timings, f"{call}_ns"),
+                        "nanoseconds",
+                        "roughconductor eval",
+                        plain,
+                        params,
+                    )
+                    for call in calls
+                ]
+    return records
+
+
+class Frame:
+    """Repeated renderings of one method on one scene at one tiling."""
+
+    def __init__(self, scene, method, tiling, size, lighting):
+        self.scene, self.method, self.tiling = scene, method, tiling
+        self.view = scene.views(size, size)["frame"]
+        self.lighting = lighting
+        self.loaded = LoadedScene(scene.text(METHODS[method], tiling))
+        self.renderings = []
+        pilot = self.loaded.render(scene.views(size, max(16, size // 8))["frame"], lighting, FRAME_SPP, seed=0)
+        self.predicted = 64 * pilot.seconds
+        self.identity = scene.first_slot().element.get("id")
+
+    def render(self, repeat):
+        """Render once more, unless it is slow."""
+        if self.predicted < LONGEST_FRAME / (1 if repeat == 0 else 3):
+            self.renderings.append(self.loaded.render(self.view, self.lighting, FRAME_SPP, seed=1 + repeat))
+
+    @property
+    def seconds(self):
+        """Median wall-clock seconds."""
+        return statistics.median(item.seconds for item in self.renderings)
+
+    @property
+    def cpu_seconds(self):
+        """Median processor seconds."""
+        return statistics.median(item.cpu_seconds for item in self.renderings)
+
+    @property
+    def label(self):
+        return self.method if self.method == "roughconductor" else f"{self.method} x{self.tiling}"
+
+
+def frame_records(scenes, size, repeats, lighting, display):
+    """Frame times of every scene, interleaved so that a busy machine is unfair to all alike."""
+    records = []
+    for scene in scenes:
+        frames = []
+        for method, tiling in FRAMES:
+            display.say(f"{scene.name}: load {method} x{tiling}")
+            frames.append(Frame(scene, method, tiling, size, lighting))
+        for repeat in range(repeats):
+            for frame in frames:
+                display.say(f"{scene.name}: {frame.label}, {repeat + 1} of {repeats}")
+                frame.render(repeat)
+        frames = [frame for frame in frames if frame.renderings]
+        records += compare_frames(scene, frames)
+    return records
+
+
+def compare_frames(scene, frames):
+    """Records of the frames of one scene: glint methods against both stock ones, and stock ones against each other."""
+    plain = frames[0]
+    coverage = len(plain.loaded.glinting_pixels(plain.identity, plain.view, GRID)) / GRID**2
+    samples = plain.view.pixels * FRAME_SPP
+    records = []
+    for frame in frames[1:]:
+        params = {
+            "scene": scene.name,
+            "tiling": frame.tiling,
+            "method": frame.method,
+            "spp": FRAME_SPP,
+            "resolution": frame.view.width,
+            "integrator": frame.lighting.integrator,
+            "max_depth": frame.lighting.max_depth,
+            "repeats": len(frame.renderings),
+        }
+        stock = [plain] + [other for other in frames if (other.method, other.tiling) == ("normalmap", frame.tiling)]
+        for other in stock:
+            if other is frame:
+                continue
+            processor = {"cpu_seconds": frame.cpu_seconds, "cpu_ratio": frame.cpu_seconds / other.cpu_seconds}
+            records.append(
+                make_record("frame", frame.seconds, "seconds", other.label, other.seconds, {**params, **processor})
+            )
+        if frame.method != "normalmap" and coverage > 0:
+            extra = 1e9 * (frame.cpu_seconds - plain.cpu_seconds) / (samples * coverage)
+            whole = 1e9 * plain.cpu_seconds / samples
+            records.append(
+                make_record(
+                    "frame/glinting_sample",
+                    extra,
+                    "nanoseconds",
+                    "sample without glints",
+                    whole,
+                    {**params, "coverage": coverage},
+                )
+            )
+    return records
+
+
+def readable(value, unit):
+    """A value with its unit for people."""
+    if value is None:
+        return "–"
+    if unit == "bytes":
+        return f"{value / 1e6:.1f} MB"
+    if unit == "nanoseconds":
+        return f"{value:.0f} ns" if value < 1e4 else f"{value / 1e3:.1f} µs"
+    if unit == "seconds":
+        return f"{value:.3f} s"
+    return f"{value:.4f}"
+
+
+def print_tables(records):
+    """One table for each name; parameters that are the same in all rows stand in the title."""
+    for name in dict.fromkeys(record["name"] for record in records):
+        mine = [record for record in records if record["name"] == name]
+        keys = list(dict.fromkeys(key for record in mine for key in record["params"]))
+        constant = [key for key in keys if len({record["params"].get(key) for record in mine}) == 1]
+        varying = [key for key in keys if key not in constant]
+        said = ", ".join(f"{key} {text(mine[0]['params'][key])}" for key in constant)
+        table = Table(
+            title=f"[bold]{name}[/bold]  {said}",
+            title_justify="left",
+            title_style="",
+            box=SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+        )
+        left = ("map", "scene", "method", "baseline", "through", "target")
+        for heading in (*varying, "value", "baseline", "its value", "ratio", "target"):
+            table.add_column(heading.replace("_", " "), justify="left" if heading in left else "right")
+        for record in mine:
+            table.add_row(*row(record, varying))
+        console.print(table)
+
+
+def row(record, keys):
+    """The texts of one record."""
+    goal = target(record)
+    verdict = "" if goal is None else f"{goal[0]}: {'reached' if goal[1] else 'MISSED'}"
+    return (
+        *(text(record["params"].get(key, "")) for key in keys),
+        readable(record["value"], record["unit"]),
+        record["baseline"],
+        readable(record["baseline_value"], record["unit"]),
+        "–" if record["ratio"] is None else f"{record['ratio']:.3g}",
+        verdict,
+    )
+
+
+def text(value):
+    """A parameter for people."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def parser():
+    """The options."""
+    result = argparse.ArgumentParser(prog="bench", description="Measure memory and speed; writes OUT/bench.json.")
+    add = result.add_argument
+    add("--res", type=number(int), help="width of the frames (default: 800, with --quick 200)")
+    add("--quick", action="store_true", help="fewer footprints, one repeat, small frames: minutes become seconds")
+    add("--only", choices=("rust", "plugins", "frames"), help="one of the three sources")
+    add("--scene-dir", type=Path, default=ROOT / "mitsuba_scenes", help="folder of scene files with a glint slot")
+    add("--max-depth", type=number(int), default=2, help="longest path of the frames (default: %(default)s, direct)")
+    add("--repeats", type=number(int), help="renderings of a frame (default: 3, with --quick 1)")
+    add("--out", type=Path, default=ROOT / "out" / "bench", help="folder of bench.json")
+    add("--cache", type=Path, default=ROOT / ".cache", help="folder of generated scene files")
+    return result
+
+
+def main(arguments=None):
+    """Measure, print tables, write bench.json."""
+    options = parser().parse_args(arguments)
+    start = time.perf_counter()
+    render.start()
+    assets = scene_assets(options.cache)
+    maps = assets()["maps"]
+    scenes = find_scenes(options.scene_dir, ["all"], assets)
+    records = []
+    with Display() as display:
+        if options.only in (None, "rust"):
+            records += rust_records(maps, options.quick, display.say)
+            records += scene_records(scenes, display.say)
+        if options.only in (None, "plugins"):
+            records += plugin_records(maps, options.quick, display.say)
+        if options.only in (None, "frames"):
+            size = options.res or (200 if options.quick else FULL_SIZE)
+            repeats = options.repeats or (1 if options.quick else 3)
+            records += frame_records(scenes, size, repeats, Lighting(max_depth=options.max_depth), display)
+    print_tables(records)
+    write_json(options.out / "bench.json", records)
+    write_json(options.out / "provenance.json", provenance.provenance())
+    verdicts = [goal[1] for goal in map(target, records) if goal is not None]
+    console.print(f"{sum(verdicts)} of {len(verdicts)} targets reached. {time.perf_counter() - start:.0f} s.")
+    console.print(f"Written: {(options.out / 'bench.json').resolve()}", soft_wrap=True, highlight=False)
+
+
+if __name__ == "__main__":
+    main()

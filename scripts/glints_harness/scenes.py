@@ -1,0 +1,207 @@
+"""Scene files with a glint slot: find them, fill the slot, and make them independent of their folder.
+
+The slot is a stock `<bsdf type="normalmap">` over `<bsdf type="roughconductor">`, so that the file renders anywhere.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree as xml
+
+from .files import digest_file, digest_text
+from .methods import Slot
+
+FULL_SIZE = 800
+"""Width and height in pixels of the frames in the paper's Figure 7; crops are given in pixels of such a frame."""
+
+PAPER_CROPS = {
+    "shoes": ((160, 600, 80, 80), (320, 160, 80, 80)),
+    "kettle": ((330, 400, 80, 80), (390, 200, 80, 80)),
+}
+"""The crops of Figure 7 (x, y, width, height), for scenes whose folder does not name its own."""
+
+CENTRAL_CROPS = ((320, 360, 80, 80), (400, 360, 80, 80))
+"""Crops of a scene that nobody has chosen crops for."""
+
+CROP_SIZE = (80, 80)
+"""Width and height of a crop that is given by its corner alone."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What of a scene is rendered: the whole film, or a crop of it, both in pixels."""
+
+    name: str
+    width: int
+    height: int
+    crop: tuple
+    """(x, y, width, height)"""
+
+    @property
+    def pixels(self):
+        return self.crop[2] * self.crop[3]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene file with a glint slot."""
+
+    name: str
+    path: Path
+    values: dict
+    """The file's parameters (`<default>`), name to text, with the places of generated files put in."""
+    crops: tuple
+    """(x, y, width, height) in pixels of a frame of `FULL_SIZE` pixels."""
+
+    @property
+    def base_tiles(self):
+        """Repetitions of the map over the unit square at tiling x1."""
+        return float(self.values.get("tiles", 1))
+
+    @property
+    def alpha(self):
+        """Beckmann roughness of a flake."""
+        return float(self.first_slot().conductor.find("float[@name='alpha']").get("value"))
+
+    @property
+    def normal_map(self):
+        """Path of the normal map."""
+        return Path(self.first_slot().filename)
+
+    def first_slot(self):
+        """The first glint slot, with parameters put in."""
+        return slots(self.resolved(1))[0][1]
+
+    def views(self, size, frame_size):
+        """The frame at `frame_size` pixels, and the crops of a frame of `size` pixels, keyed by name."""
+        views = [View("frame", frame_size, frame_size, (0, 0, frame_size, frame_size))]
+        for index, crop in enumerate(self.crops, 1):
+            views.append(View(f"crop{index}", size, size, scale_crop(crop, size)))
+        return {view.name: view for view in views}
+
+    def text(self, method, tiling):
+        """The scene with `method` in its slot, as XML without parameters and with absolute file names."""
+        root = self.resolved(tiling)
+        fill_slots(root, method)
+        return xml.tostring(root, encoding="unicode")
+
+    def resolved(self, tiling):
+        """The scene's XML at a tiling, its slot untouched."""
+        values = {**self.values, "tiles": f"{self.base_tiles * tiling:g}"}
+        return resolve(xml.parse(self.path).getroot(), values, self.path.parent)
+
+
+def scale_crop(crop, size):
+    """A crop given for a frame of `FULL_SIZE` pixels in a frame of `size` pixels; at least one pixel."""
+    scale = size / FULL_SIZE
+    x, y = (min(int(value * scale), size - 1) for value in crop[:2])
+    width, height = (max(1, round(value * scale)) for value in crop[2:])
+    return (x, y, min(width, size - x), min(height, size - y))
+
+
+def substitute(text, values):
+    """`text` with `$name` replaced, also in what was put in."""
+    for name in sorted(values, key=len, reverse=True):
+        if f"${name}" in text:
+            rest = {key: value for key, value in values.items() if key != name}
+            text = text.replace(f"${name}", substitute(values[name], rest))
+    return text
+
+
+def resolve(root, values, folder):
+    """Put parameters in and make the names of files that lie beside the scene absolute; changes `root`."""
+    for default in root.findall("default"):
+        root.remove(default)
+    for element in root.iter():
+        for key, text in element.attrib.items():
+            element.set(key, substitute(text, values))
+        if element.get("name") == "filename" and (folder / element.get("value", "")).is_file():
+            element.set("value", str((folder / element.get("value")).resolve()))
+    return root
+
+
+def slots(root):
+    """Pairs (parent, slot) of every glint slot under `root`."""
+    found = []
+    for parent in root.iter():
+        for element in parent:
+            if element.tag == "bsdf" and element.get("type") == "normalmap":
+                bitmap = element.find("texture[@name='normalmap']")
+                conductor = element.find("bsdf[@type='roughconductor']")
+                filename = None if bitmap is None else bitmap.find("string[@name='filename']")
+                if filename is not None and conductor is not None:
+                    to_uv = bitmap.find("transform[@name='to_uv']")
+                    found.append((parent, Slot(element, filename.get("value"), to_uv, conductor)))
+    return found
+
+
+def fill_slots(root, method):
+    """Put `method` into every slot under `root`; returns how many there were."""
+    found = slots(root)
+    for parent, slot in found:
+        position = list(parent).index(slot.element)
+        parent.remove(slot.element)
+        parent.insert(position, method.element(slot))
+    return len(found)
+
+
+def scene_digest(text):
+    """Digest of a resolved scene: its text, with the content of every file in place of the file's name."""
+    root = xml.fromstring(text)
+    for element in root.iter():
+        if element.get("name") == "filename" and Path(element.get("value", "")).is_file():
+            element.set("value", digest_file(element.get("value")))
+    return digest_text(xml.tostring(root, encoding="unicode"))
+
+
+def find_scenes(folder, wanted, assets):
+    """Scenes with a slot in `folder` and below, by file name.
+
+    `wanted` is a list of names, or ["all"]. `assets` is called without arguments when a scene needs generated files;
+    it returns {"assets": folder, "maps": {"isotropic": path, "brushed": path}}.
+    """
+    folder = Path(folder)
+    files = {}
+    for path in sorted(folder.rglob("*.xml")):
+        if slots(xml.parse(path).getroot()):
+            files.setdefault(path.stem, path)
+    names = list(files) if wanted == ["all"] else wanted
+    missing = [name for name in names if name not in files]
+    if missing or not names:
+        there = ", ".join(files) or "none"
+        raise ValueError(f"no scene {', '.join(missing)} with a glint slot in {folder}; there are: {there}")
+    return [open_scene(files[name], folder, assets) for name in sorted(names, key=paper_order)]
+
+
+def paper_order(name):
+    """The order of Figure 7 for its scenes, then the alphabet."""
+    known = list(PAPER_CROPS)
+    return (known.index(name) if name in known else len(known), name)
+
+
+def open_scene(path, folder, assets):
+    """Read a scene file's parameters; have the files generated that it names and that are not there."""
+    values = {item.get("name"): item.get("value") for item in xml.parse(path).getroot().findall("default")}
+    if "assets" in values:
+        values["assets"] = str(assets()["assets"])
+    scene = Scene(path.stem, path, values, find_crops(path.stem, folder))
+    if not (path.parent / scene.normal_map).is_file():
+        if "normalmap" not in values:
+            raise ValueError(f"{path}: the normal map {scene.normal_map} does not exist")
+        values["normalmap"] = str(assets()["maps"][map_kind(scene.normal_map)])
+    return scene
+
+
+def map_kind(path):
+    """Which generated map stands in for a map of this name."""
+    return "brushed" if "brushed" in path.stem else "isotropic"
+
+
+def find_crops(name, folder):
+    """Crops from the folder's `scenes.json` if it has them, else the paper's, else two in the middle."""
+    listing = Path(folder) / "scenes.json"
+    if listing.is_file():
+        entry = json.loads(listing.read_text(encoding="utf-8")).get(name)
+        if isinstance(entry, dict) and "crops" in entry:
+            return tuple((*crop, *CROP_SIZE)[:4] for crop in entry["crops"])
+    return PAPER_CROPS.get(name, CENTRAL_CROPS)
