@@ -144,7 +144,7 @@ def test_sample_has_the_density_of_pdf(wavy_map, plugin, alpha, footprint, direc
     counts, weights = draw_cells(bsdf, si, bins, 40_000, np.random.default_rng(1))
     # One case in ten thousand fails by chance; the seed is fixed.
     assert chi_square(counts, probabilities) > 1e-4 / len(CASES)
-    # The broken twin: a density without the sampled microfacet's cosine, as Eq. 18 is printed, is told apart.
+    # The broken twin: a density that is off by a factor linear in the half vector is told apart.
     if direction == "grazing":
         centers, _, _ = cell_points(bins)
         tilted = probabilities[:-1] * (1 + 0.3 * centers[:, 0])

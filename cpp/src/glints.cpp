@@ -44,6 +44,15 @@ bridge::Surface to_bridge(const SurfaceOptions &o) {
             o.masking_alpha_v};
 }
 
+// A Rust string holds nothing else.
+rust::Str utf8(const std::string &filename) {
+    try {
+        return rust::Str(filename);
+    } catch (const std::invalid_argument &) {
+        throw Error("filename \"" + filename + "\": is not valid UTF-8; rename the file");
+    }
+}
+
 // Calls a constructor of the bridge; its errors become ours, with the same text.
 template <typename Construct>
 auto translated(Construct construct) {
@@ -69,9 +78,7 @@ NormalMap::~NormalMap() = default;
 
 NormalMap NormalMap::load(const std::string &filename, Encoding encoding, bool flip_y) {
     return translated([&] {
-        // Throws on invalid UTF-8, which a Rust string cannot hold.
-        rust::Str name(filename);
-        return NormalMap(std::make_unique<Impl>(Impl{bridge::load_map(name, to_bridge(encoding), flip_y)}));
+        return NormalMap(std::make_unique<Impl>(Impl{bridge::load_map(utf8(filename), to_bridge(encoding), flip_y)}));
     });
 }
 
@@ -79,7 +86,8 @@ NormalMap NormalMap::from_normals(const std::string &name, uint32_t width, uint3
                                   const std::vector<float> &xyz) {
     return translated([&] {
         rust::Slice<const float> components(xyz.data(), xyz.size());
-        return NormalMap(std::make_unique<Impl>(Impl{bridge::map_from_normals(name, width, height, components)}));
+        return NormalMap(
+            std::make_unique<Impl>(Impl{bridge::map_from_normals(utf8(name), width, height, components)}));
     });
 }
 

@@ -17,7 +17,7 @@ from .summary import common_spp, summarise
 ROOT = Path(__file__).resolve().parents[2]
 
 DEFAULT_SPPS = (1, 4, 16, 64)
-DEFAULT_LIMIT = 310.0
+DEFAULT_LIMIT = 290.0
 """Seconds; see `Settings.limit`. Keeps the default comparison under six minutes on a slow or busy machine."""
 
 
@@ -43,7 +43,7 @@ def parser():
     add("--reference-time", type=number(float), default=8.0, help="least seconds a crop (default: %(default)g)")
     add("--reference-spp", type=number(int), help="least samples per pixel of a reference, instead of its time")
     add("--reference-method", default=REFERENCE.name, choices=METHODS, help="its model (default: %(default)s)")
-    add("--limit", type=number(float), help="seconds for everything; default: 310, or none with --spp or --time")
+    add("--limit", type=number(float), help="seconds for everything; default: 290, or none with --spp or --time")
     add("--exposure", type=float, default=0.0, help="stops, for the pictures only (default: 0)")
     add("--out", type=Path, default=ROOT / "out" / "compare", help="folder of the report")
     add("--cache", type=Path, default=ROOT / ".cache", help="folder of references and generated scene files")
@@ -150,4 +150,7 @@ def main(arguments=None):
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit("compare: interrupted; finished references are kept, results.json lists the finished methods")

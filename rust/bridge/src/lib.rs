@@ -4,7 +4,7 @@
 //! # Invariants
 //!
 //! * Errors cross as `Result`, which cxx turns into exceptions. Constructors run inside [`guarded`], so that
-//!   not even a panic aborts the host: it becomes an error, too.
+//!   a panic does not abort the host: it becomes an error, too. (Running out of memory still aborts.)
 //! * Evaluation is total and free of panics; it takes plain values and a shared reference, from any thread.
 //! * This crate has no unsafe code of its own.
 

@@ -129,7 +129,7 @@ impl Brdf {
     /// The density alone.
     pub fn pdf(&self, footprint: &Footprint, wi: Vec3, wo: Vec3) -> f32 {
         DirectionPair::new(wi, wo).map_or(0.0, |pair| {
-            self.method.density(footprint, pair.half) / (4.0 * wo.dot(pair.half))
+            self.method.density(footprint, pair.half) / (4.0 * pair.cos)
         })
     }
 
@@ -148,10 +148,9 @@ impl Brdf {
             return None;
         }
         let half = self.method.sample(footprint, four_uniforms(u))?;
+        // The half vector of the two directions, as any later query sees it: rounding in the reflection then
+        // cannot tell a sample's density from that query's.
         let pair = DirectionPair::reflected(wi, half)?;
-        // Evaluated as any caller would, from the two directions: rounding in the reflection then cannot tell
-        // a sample's density from that of a later query.
-        let pair = DirectionPair::new(wi, pair.wo)?;
         let evaluation = self.evaluate_pair(footprint, &pair);
         (evaluation.pdf > 0.0).then_some(Sample {
             wo: pair.wo,
@@ -167,7 +166,7 @@ impl Brdf {
         let masking = self.masking.g1(pair.wi) * self.masking.g1(pair.wo);
         Evaluation {
             value: masking * reflection.value / (4.0 * pair.wi.z),
-            pdf: reflection.density / (4.0 * pair.wo.dot(pair.half)),
+            pdf: reflection.density / (4.0 * pair.cos),
         }
     }
 }
@@ -183,10 +182,8 @@ fn four_uniforms([u1, u2, u3]: [f32; 3]) -> [f32; 4] {
     let mut z = word(u1)
         .wrapping_mul(0x9e37_79b9_7f4a_7c15)
         .wrapping_add(word(u2) << 32 | word(u3));
-    for multiplier in [0xbf58_476d_1ce4_e5b9, 0x94d0_49bb_1331_11eb] {
-        z = (z ^ z >> 30).wrapping_mul(multiplier);
-        z ^= z >> 27;
-    }
+    z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
     z ^= z >> 31;
     let uniform = |bits: u64| (bits & 0xff_ffff) as f32 * (1.0 / 16_777_216.0);
     [uniform(z >> 40), uniform(z >> 16), u2, u3]
@@ -275,6 +272,44 @@ mod tests {
             }
             assert_relative_eq!(estimate / f64::from(COUNT), albedo, max_relative = 0.01);
             assert_relative_eq!(drawn / f64::from(COUNT), pdf, max_relative = 0.005);
+        }
+    }
+
+    #[test]
+    fn mirrored_grazing_directions_have_a_positive_density() {
+        let normals = [Vec3::Z];
+        let map = NormalMap::from_normals("flat", 1, 1, &normals).unwrap();
+        let model = FlakeModel {
+            flake: Flake::new(0.1).unwrap(),
+            normalization: Normalization::Projected,
+        };
+        let brdf = Brdf::new(&map, Masking::None, || {
+            Ok(Box::new(Direct::new(map.clone(), model)))
+        })
+        .unwrap();
+        let footprint = brdf.footprint([0.5; 2], [0.0; 2], [0.0; 2]);
+        let (wi, wo) = (Vec3::new(1.0, 0.0, 1e-4), Vec3::new(-0.999_999_94, 0.0, 1e-4));
+        assert!(brdf.evaluate(&footprint, wi, wo).pdf > 0.0);
+        assert!(brdf.pdf(&footprint, wi, wo) > 0.0);
+    }
+
+    #[test]
+    fn the_point_of_the_footprint_is_uniform() {
+        // Also along a line of the lobe's numbers, and for consecutive first numbers.
+        const CELLS: usize = 16;
+        const COUNT: u32 = 200_000;
+        let fixed = |i: u32| [i as f32 / COUNT as f32, 0.25, 0.75];
+        let lattice = |i: u32| [0.5, (i % 500) as f32 / 500.0, (i / 500) as f32 / 400.0];
+        for numbers in [&fixed as &dyn Fn(u32) -> [f32; 3], &lattice] {
+            let mut counts = [0.0_f64; CELLS * CELLS];
+            for i in 0..COUNT {
+                let [x, y, _, _] = four_uniforms(numbers(i));
+                counts[(x * CELLS as f32) as usize * CELLS + (y * CELLS as f32) as usize] += 1.0;
+            }
+            let expected = f64::from(COUNT) / counts.len() as f64;
+            let statistic: f64 = counts.iter().map(|c| (c - expected).powi(2) / expected).sum();
+            // 255 degrees of freedom: mean 255, standard deviation 23.
+            assert!((255.0 - 100.0..255.0 + 115.0).contains(&statistic), "{statistic}");
         }
     }
 

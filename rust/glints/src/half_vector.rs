@@ -11,6 +11,8 @@ pub struct DirectionPair {
     pub wo: Vec3,
     /// `(wi + wo) / |wi + wo|`; `half.z > 0`.
     pub half: Vec3,
+    /// `wi . half = wo . half = |wi + wo| / 2 > 0`; the dot products cancel at grazing angles.
+    pub cos: f32,
 }
 
 impl DirectionPair {
@@ -19,11 +21,12 @@ impl DirectionPair {
     pub fn new(wi: Vec3, wo: Vec3) -> Option<Self> {
         let above = wi.z > 0.0 && wo.z > 0.0;
         let half = (wi + wo).try_normalize()?;
-        above.then_some(Self { wi, wo, half })
+        let cos = 0.5 * (wi + wo).length();
+        above.then_some(Self { wi, wo, half, cos })
     }
 
-    /// The pair that reflects `wi` at the normal `half`; `None` if `wi` or the reflection is not above both
-    /// horizons.
+    /// The pair that reflects `wi` at the normal `half`, up to rounding; `None` if `wi` or the reflection is
+    /// not above both horizons.
     #[inline]
     pub fn reflected(wi: Vec3, half: Vec3) -> Option<Self> {
         let cos = wi.dot(half);
@@ -31,6 +34,6 @@ impl DirectionPair {
             return None;
         }
         let wo = (2.0 * cos * half - wi).normalize();
-        (wo.z > 0.0).then_some(Self { wi, wo, half })
+        Self::new(wi, wo)
     }
 }

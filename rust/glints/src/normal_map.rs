@@ -22,6 +22,9 @@ pub const MIN_Z: f32 = 1e-3;
 /// Most texels per side; texel indices must fit into 32 bits.
 const MAX_SIDE: u32 = 65_535;
 
+/// Most bytes of a decoded image: 32K x 32K texels of three floats.
+const MAX_DECODED_BYTES: u64 = 12 << 30;
+
 /// How a file stores a normal's components c.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Encoding {
@@ -196,8 +199,12 @@ fn decode(path: &Path) -> Result<DynamicImage> {
             "cannot be opened ({e}); check the path and the permissions"
         ))
     })?;
-    // Maps of 16K x 16K texels are legitimate; their side is checked after decoding.
-    reader.limits(Limits::no_limits());
+    // Maps of 16K x 16K texels are legitimate, but a broken header must not ask for all the memory there is.
+    let mut limits = Limits::no_limits();
+    limits.max_image_width = Some(MAX_SIDE);
+    limits.max_image_height = Some(MAX_SIDE);
+    limits.max_alloc = Some(MAX_DECODED_BYTES);
+    reader.limits(limits);
     reader.decode().map_err(|e| {
         failed(format!(
             "cannot be decoded ({e}); an EXR, PNG, JPEG or TIFF file with red, green and blue is needed"

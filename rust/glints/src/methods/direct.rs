@@ -6,8 +6,8 @@
 //!
 //! **Layout** One unit normal a texel, 12 bytes.
 //!
-//! **Cost** Proportional to the texels of the footprint, at most a few periods of the map; `sample` costs
-//! O(1).
+//! **Cost** Proportional to the texels of the footprint, at most about fifty periods of the map; `sample`
+//! costs O(1).
 
 use glam::Vec3;
 

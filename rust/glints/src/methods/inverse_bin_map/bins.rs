@@ -75,8 +75,9 @@ impl BinGrid {
         pack(self.bin(m))
     }
 
-    /// The normal `b_j` that stands for a bin: its centre, or for a bin whose centre is not on the disk the
-    /// point halfway between its corner nearest to the pole and the rim.
+    /// The normal `b_j` that stands for a bin: its centre, or, for a bin whose centre lies outside the disk
+    /// or within an eighth of a bin of its rim, the point halfway between its corner nearest to the pole and
+    /// the rim.
     #[inline]
     pub fn representative(&self, (column, row): Bin) -> Vec3 {
         let width = 2.0 / self.resolution as f32;
@@ -172,10 +173,8 @@ impl Neighbourhood {
             if !any {
                 continue;
             }
-            for (offset, &bin) in block.iter().enumerate() {
-                if is_near(bin)
-                    && let Some(slot) = self.slot(bin)
-                {
+            for (offset, &bin) in block.iter().enumerate().filter(|&(_, &bin)| is_near(bin)) {
+                if let Some(slot) = self.slot(bin) {
                     visit(slot, index * BLOCK + offset);
                 }
             }

@@ -22,8 +22,8 @@
 //!   minus the probability of failure (about 1 %).
 //! * *Gain.* The truncation would darken the image by that percent. `g_j = 1 / (mass of the lobe inside its
 //!   21 bins)` puts the energy back, so that the distribution of normals integrates to one ([`LobeGain`]).
-//! * *Rim.* A bin whose centre lies outside the unit disk is represented by a point between its innermost
-//!   corner and the disk's rim.
+//! * *Rim.* A bin whose centre lies outside the unit disk, or within an eighth of a bin of its rim, is
+//!   represented by a point between its innermost corner and the rim.
 //!
 //! **Layout**, for N texels and b^2 bins:
 //!
@@ -32,6 +32,9 @@
 //! | bin map, `by << 16 \| bx` per texel, row by row | B | 4 N |
 //! | inverse bin map and its index ([`inverse::InverseMap`]) | B^-1, I | 4 N + 4.2 b^2 |
 //! | forest | F | about 3 bytes per leaf of at most `leaf_size` texels |
+//!
+//! The index takes over at tiny roughness: `alpha = 0.0001` derives 16384 bins a side and 1.1 GB, whatever
+//! the map; give `bins` then.
 //!
 //! **Bounds** A query costs O(perimeter) in the forest. A small footprint is answered by scanning the bin map
 //! instead ([`SCAN_FACTOR`]), which yields the same weights at about a nanosecond a texel.
@@ -289,7 +292,10 @@ fn lobe_mass(bin_width: f64, alpha: f64, radius: f64, azimuth: f64) -> f64 {
         (0.169_990_521_792_428, 0.326_072_577_431_273),
         (0.430_568_155_797_026, 0.173_927_422_568_727),
     ];
-    let cos_tilt = (1.0 - radius * radius).max(1e-6).sqrt();
+    // Wider bins hold the whole lobe, and a tilt beyond 70 degrees changes nothing any more; the rule
+    // resolves neither.
+    let bin_width = bin_width.min(1.5 * alpha);
+    let cos_tilt = (1.0 - radius * radius).max(0.12).sqrt();
     let (sin_phi, cos_phi) = azimuth.sin_cos();
     let density = |x: f64, y: f64| {
         let radial = (x * cos_phi + y * sin_phi) / cos_tilt;

@@ -106,7 +106,7 @@ proptest! {
         let map = random_map(width, height, 1.5, seed);
         let ibm = build(&map, 0.05, 13, 3);
         let footprint = Footprint::in_texels(width, height, c, a, b);
-        // Neighbourhoods of one fifth of the grid each, without overlap, miss only their corners.
+        // The central slot of every bin's own neighbourhood.
         let mut sum = 0.0;
         for row in 0..13 {
             for column in 0..13 {
