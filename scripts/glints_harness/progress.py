@@ -7,7 +7,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 console = Console()
 if not console.is_terminal:
-    console.width = 120
+    console.width = 130
 
 
 class Display:
