@@ -1,5 +1,12 @@
+import sys
+from pathlib import Path
+
 import mitsuba as mi
 import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# The harness and the generators of the scenes are folders of the repository, not installed packages.
+sys.path[:0] = [str(ROOT / "scripts"), str(ROOT / "mitsuba_scenes")]
 
 mi.set_variant("scalar_rgb")
 

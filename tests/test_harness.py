@@ -11,12 +11,10 @@ from xml.etree import ElementTree as xml
 import numpy as np
 import pytest
 import support
-
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
-
 from glints_harness import bench, compare, files, images, metrics, reference, render, scenes
 from glints_harness.methods import GLINTS, METHODS, choose
+
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
 MINI_SCENE = """<scene version="3.0.0">
     <default name="tiles" value="2"/>

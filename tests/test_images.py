@@ -6,18 +6,15 @@ where they belong (distance of the compressed images), and does filtering do its
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 
+import generate
 import mitsuba as mi
 import numpy as np
 import pytest
+from glints_harness import methods, render, scenes
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "scripts"), str(ROOT / "mitsuba_scenes")]
-
-import generate
-from glints_harness import methods, render, scenes
 
 ALPHA = "0.02"  # heavy tails of smaller roughnesses would need a reference of minutes
 SIDE, BLOCK = 32, 16  # pixels of the crop and of a block

@@ -1,6 +1,5 @@
 """The BSDF plugins as Mitsuba sees them: texels, footprints, colours, consistency. Their filters have tests elsewhere."""
 
-import ctypes
 import math
 import pathlib
 import subprocess
@@ -11,6 +10,7 @@ import mitsuba as mi
 import mitsuba_glints
 import numpy as np
 import pytest
+from glints_harness import timer
 from support import (
     BSDFS,
     FILTERED,
@@ -498,31 +498,14 @@ def test_images_do_not_depend_on_the_number_of_threads(rough_map, plugin):
 def test_timer(rough_map):
     """The measuring library of the benchmarks, with the structures documented in timer.h; it takes any BSDF."""
 
-    class Settings(ctypes.Structure):
-        _fields_ = [
-            ("footprint_width_u", ctypes.c_float),
-            ("footprint_width_v", ctypes.c_float),
-            ("max_angle_wi", ctypes.c_float),
-            ("sampled_wo", ctypes.c_float),
-            ("interactions", ctypes.c_uint32),
-            ("repetitions", ctypes.c_uint32),
-            ("seed", ctypes.c_uint32),
-        ]
-
-    class Timings(ctypes.Structure):
-        names = ("eval_ns", "pdf_ns", "sample_ns", "eval_pdf_ns", "overhead_ns", "valid_samples", "checksum")
-        _fields_ = [(name, ctypes.c_double) for name in names]
-
-    timer = ctypes.CDLL(str(pathlib.Path(mitsuba_glints.plugin_dir()) / "plugins" / "libglints_timer.so"))
-    timer.glints_time_bsdf.argtypes = [ctypes.c_void_p, ctypes.POINTER(Settings), ctypes.POINTER(Timings)]
-    timer.glints_time_bsdf.restype = ctypes.c_char_p
-    settings = Settings(0.1, 0.1, 0.8, 0.5, 100, 2, 1)
+    time_bsdf = timer.library_call()
+    settings = timer.Settings(0.1, 0.1, 0.8, 0.5, 100, 2, 1)
 
     for material in (bsdf("glints_ibm", rough_map), mi.load_dict({"type": "roughconductor"})):
-        timings = Timings()
-        assert timer.glints_time_bsdf(material.ptr, settings, timings) is None
+        timings = timer.Timings()
+        assert time_bsdf(material.ptr, settings, timings) is None
         assert min(timings.eval_ns, timings.pdf_ns, timings.sample_ns, timings.eval_pdf_ns) > timings.overhead_ns > 0
         assert 0.5 < timings.valid_samples <= 1 and timings.checksum > 0
 
     emitter = mi.load_dict({"type": "constant"})
-    assert b"not a BSDF" in timer.glints_time_bsdf(emitter.ptr, settings, Timings())
+    assert b"not a BSDF" in time_bsdf(emitter.ptr, settings, timer.Timings())

@@ -33,14 +33,20 @@ class Timings(ctypes.Structure):
     ]
 
 
-def load():
-    """The timer, a function from BSDF, footprint width in uv and number of shading points to `Timings`."""
+def library_call():
+    """`glints_time_bsdf` itself: BSDF address, settings and timings to an error text or None."""
     import mitsuba_glints
 
     library = ctypes.CDLL(str(Path(mitsuba_glints.plugin_dir()) / "plugins" / "libglints_timer.so"))
     call = library.glints_time_bsdf
     call.argtypes = [ctypes.c_void_p, ctypes.POINTER(Settings), ctypes.POINTER(Timings)]
     call.restype = ctypes.c_char_p
+    return call
+
+
+def load():
+    """The timer, a function from BSDF, footprint width in uv and number of shading points to `Timings`."""
+    call = library_call()
 
     def measure(bsdf, width, interactions, repetitions=3):
         settings = Settings(width, width, WIDEST_ANGLE, 1.0, interactions, repetitions, 1)
