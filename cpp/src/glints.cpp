@@ -118,9 +118,19 @@ Brdf Brdf::direct(const NormalMap &map, const SurfaceOptions &surface) {
         [&] { return Brdf(std::make_unique<Impl>(Impl{bridge::direct(*map.m_impl->map, to_bridge(surface))})); });
 }
 
-Brdf Brdf::unfiltered(const NormalMap &map, const SurfaceOptions &surface) {
-    return translated(
-        [&] { return Brdf(std::make_unique<Impl>(Impl{bridge::unfiltered(*map.m_impl->map, to_bridge(surface))})); });
+Brdf Brdf::unfiltered(const NormalMap &map, const SurfaceOptions &surface, Interpolation interpolation) {
+    return translated([&] {
+        bool bilinear = interpolation == Interpolation::Bilinear;
+        return Brdf(
+            std::make_unique<Impl>(Impl{bridge::unfiltered(*map.m_impl->map, to_bridge(surface), bilinear)}));
+    });
+}
+
+Brdf Brdf::yan16(const NormalMap &map, const SurfaceOptions &surface, const Yan16Options &options) {
+    return translated([&] {
+        bridge::Yan16Options given{options.curved, options.refinement, options.footprint_sigma};
+        return Brdf(std::make_unique<Impl>(Impl{bridge::yan16(*map.m_impl->map, to_bridge(surface), given)}));
+    });
 }
 
 Evaluation Brdf::evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept {
@@ -147,7 +157,8 @@ float Brdf::ndf(const Footprint &footprint, const Vec3 &h) const noexcept {
 
 Statistics Brdf::statistics() const {
     auto s = m_impl->brdf->statistics();
-    return {std::string(s.method), s.structure_bytes, s.build_seconds, s.bins, s.masking_alpha_u, s.masking_alpha_v};
+    return {std::string(s.method), s.alpha, s.structure_bytes,  s.build_seconds,
+            s.bins,                s.masking_alpha_u, s.masking_alpha_v};
 }
 
 } // namespace glints

@@ -76,6 +76,20 @@ struct GLINTS_API InverseBinMapOptions {
     uint32_t leaf_size = 0; ///< most texels of a leaf of the forest; 0: the paper's 10
 };
 
+/// What the surface is between the centres of a map's texels.
+enum class Interpolation : uint8_t {
+    Nearest,  ///< piecewise flat: one normal a texel
+    Bilinear, ///< projected normals are interpolated bilinearly
+};
+
+/// Parameters of Yan et al. 2016; the intrinsic roughness is `SurfaceOptions::alpha / sqrt(2)`.
+struct GLINTS_API Yan16Options {
+    /// Curved elements follow the bilinearly interpolated map; flat ones have the texels' normals.
+    bool curved = false;
+    uint32_t refinement = 1;      ///< curved elements per texel and side, 1 to 16
+    float footprint_sigma = 0.5f; ///< standard deviation of the Gaussian footprint in pixels, in [0.05, 4]
+};
+
 /// A pixel's footprint: the parallelogram centred at (u, v), spanned by the two partial derivatives.
 struct Footprint {
     float u, v;
@@ -122,6 +136,7 @@ private:
 /// What a method built, for tables and logs.
 struct Statistics {
     std::string method;
+    float alpha;                            ///< Beckmann roughness of a flake
     uint64_t structure_bytes;               ///< memory that `evaluate`, `pdf` and `sample` need
     double build_seconds;                   ///< wall time of the construction, without reading the file
     uint32_t bins;                          ///< bins per side; 0 for methods without bins
@@ -136,8 +151,11 @@ public:
                                 const InverseBinMapOptions &options = {});
     /// The exact sum over every texel of the footprint (Eq. 11).
     static Brdf direct(const NormalMap &map, const SurfaceOptions &surface);
-    /// The texel under the footprint's centre (Eq. 5), whatever the footprint.
-    static Brdf unfiltered(const NormalMap &map, const SurfaceOptions &surface);
+    /// The normal under the footprint's centre (Eq. 5), whatever the footprint.
+    static Brdf unfiltered(const NormalMap &map, const SurfaceOptions &surface,
+                           Interpolation interpolation = Interpolation::Nearest);
+    /// Position-normal distribution of 4D Gaussians, Yan et al. 2016. `surface.normalization` has to be `Projected`.
+    static Brdf yan16(const NormalMap &map, const SurfaceOptions &surface, const Yan16Options &options = {});
 
     Evaluation evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept;
     /// `evaluate(...).value` alone, and `evaluate(...).pdf` alone.

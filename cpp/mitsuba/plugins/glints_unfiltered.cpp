@@ -6,7 +6,16 @@ The reflection of the one flake under the shading point (Eq. 5 of Atanasov et al
 what `glints_ibm` and `glints_direct` filter. With very many samples per pixel its images are the independent reference
 of theirs; with few they are noisy and flicker.
 
-All parameters are the common ones, documented in `glints_ibm.cpp`; there are no others.
+Parameters of this plugin
+-------------------------
+
+The common ones are documented in `glints_ibm.cpp`.
+
+| Parameter       | Type   | Meaning                                                                               |
+|-----------------|--------|---------------------------------------------------------------------------------------|
+| `interpolation` | string | What the surface is between the centres of texels. `nearest`: piecewise flat, one     |
+|                 |        | flake a texel, as the other plugins see it. `bilinear`: the projected normals are     |
+|                 |        | interpolated, the surface of `glints_yan16` with curved elements. (Default: `nearest`)|
 
 Guidance
 --------
@@ -31,9 +40,10 @@ Python:
 */
 #include "registry.h"
 
-static glints::Brdf make_brdf(const mitsuba::Properties &, const glints::NormalMap &map,
+static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::NormalMap &map,
                               const glints::SurfaceOptions &surface) {
-    return glints::Brdf::unfiltered(map, surface);
+    auto interpolation = glints_mitsuba::choice_parameter(props, "interpolation", {"nearest", "bilinear"});
+    return glints::Brdf::unfiltered(map, surface, glints::Interpolation(interpolation));
 }
 
 extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {

@@ -112,7 +112,7 @@ public:
             << "  plugin = " << m_parameters.plugin << ",\n"
             << "  filename = \"" << m_parameters.filename << "\",\n"
             << "  resolution = " << m_width << " x " << m_height << ",\n"
-            << "  alpha = " << m_parameters.surface.alpha << ",\n"
+            << "  alpha = " << s.alpha << ",\n"
             << "  tiles = " << m_parameters.tiles << ",\n"
             << "  to_uv = " << string::indent(m_parameters.to_uv.matrix, 10) << ",\n"
             << m_reflectance.to_string() << ",\n"

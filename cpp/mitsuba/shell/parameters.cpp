@@ -18,25 +18,6 @@ using namespace mitsuba;
 
 namespace {
 
-template <typename T>
-struct Choice {
-    const char *name;
-    T value;
-};
-
-/// The choice a parameter names. Anything else is refused with the list of what is allowed.
-template <typename T>
-T choice(const Properties &props, const char *name, std::initializer_list<Choice<T>> choices, const char *fallback) {
-    std::string given(props.get<std::string_view>(name, fallback));
-    std::string allowed;
-    for (const Choice<T> &c : choices) {
-        if (given == c.name)
-            return c.value;
-        allowed += (allowed.empty() ? "\"" : ", \"") + std::string(c.name) + "\"";
-    }
-    Throw("%s: parameter \"%s\" is \"%s\"; it must be one of %s.", props.plugin_name(), name, given, allowed);
-}
-
 /// The first of the named parameters that a scene sets, or null.
 const char *first_given(const Properties &props, std::initializer_list<const char *> names) {
     for (const char *name : names)
@@ -106,6 +87,27 @@ uint32_t unsigned_parameter(const Properties &props, const char *name, uint32_t 
     return (uint32_t) value;
 }
 
+size_t choice_parameter(const Properties &props, const char *name, std::initializer_list<const char *> choices) {
+    std::string given(props.get<std::string_view>(name, *choices.begin()));
+    std::string allowed;
+    size_t index = 0;
+    for (const char *choice : choices) {
+        if (given == choice)
+            return index;
+        allowed += (index == 0 ? "\"" : ", \"") + std::string(choice) + "\"";
+        ++index;
+    }
+    Throw("%s: parameter \"%s\" is \"%s\"; it must be one of %s.", props.plugin_name(), name, given, allowed);
+}
+
+float roughness_parameter(const Properties &props, const char *other, float factor, float fallback) {
+    if (!props.has_property(other))
+        return fallback;
+    if (props.has_property("alpha"))
+        refuse_conflict(props, "alpha", other, "both set the roughness of a flake");
+    return factor * props.get<float>(other);
+}
+
 Parameters::Parameters(const Properties &props) : plugin(props.plugin_name()) {
     read_map(props);
     read_placement(props);
@@ -120,11 +122,7 @@ void Parameters::read_map(const Properties &props) {
               plugin);
     filename = file_resolver()->resolve(props.get<std::string_view>("filename")).string();
 
-    encoding = choice<glints::Encoding>(props, "encoding",
-                                        {{"auto", glints::Encoding::Automatic},
-                                         {"unsigned", glints::Encoding::Unsigned},
-                                         {"signed", glints::Encoding::Signed}},
-                                        "auto");
+    encoding = glints::Encoding(choice_parameter(props, "encoding", {"auto", "unsigned", "signed"}));
     flip_y = props.get<bool>("flip_y", false);
 }
 
@@ -145,14 +143,12 @@ void Parameters::read_placement(const Properties &props) {
 
 void Parameters::read_surface(const Properties &props) {
     surface.alpha = props.get<float>("alpha", surface.alpha);
-    surface.normalization = choice<glints::Normalization>(
-        props, "normalization",
-        {{"projected", glints::Normalization::Projected}, {"paper", glints::Normalization::Paper}}, "projected");
+    surface.normalization = glints::Normalization(choice_parameter(props, "normalization", {"projected", "paper"}));
 }
 
 void Parameters::read_masking(const Properties &props) {
-    surface.masking = choice<glints::Masking>(
-        props, "masking", {{"none", glints::Masking::None}, {"beckmann", glints::Masking::Beckmann}}, "beckmann");
+    bool masked = choice_parameter(props, "masking", {"beckmann", "none"}) == 0;
+    surface.masking = masked ? glints::Masking::Beckmann : glints::Masking::None;
 
     require_both(props, "masking_alpha_u", "masking_alpha_v");
     const char *given = first_given(props, {"masking_alpha_u"});

@@ -5,6 +5,7 @@
 #pragma once
 
 #include <glints/glints.h>
+#include <initializer_list>
 #include <mitsuba/core/properties.h>
 #include <string_view>
 
@@ -37,5 +38,15 @@ GLINTS_MITSUBA_API void refuse_other_variants(std::string_view name, mitsuba::Pl
 
 /// A whole, non-negative parameter; `fallback` if it is absent.
 GLINTS_MITSUBA_API uint32_t unsigned_parameter(const mitsuba::Properties &props, const char *name, uint32_t fallback);
+
+/// The index of a parameter's text among the choices, of which the first is the default; anything else is refused with
+/// the list of what is allowed.
+GLINTS_MITSUBA_API size_t choice_parameter(const mitsuba::Properties &props, const char *name,
+                                           std::initializer_list<const char *> choices);
+
+/// Roughness alpha from another parameter that stands for it, alpha = factor * value; `fallback` where it is not given.
+/// Both together are refused.
+GLINTS_MITSUBA_API float roughness_parameter(const mitsuba::Properties &props, const char *other, float factor,
+                                             float fallback);
 
 } // namespace glints_mitsuba

@@ -18,7 +18,8 @@ use glints::flakes::{FlakeModel, Normalization};
 use glints::methods::Method;
 use glints::methods::direct::Direct;
 use glints::methods::inverse_bin_map::{self, InverseBinMap};
-use glints::methods::unfiltered::Unfiltered;
+use glints::methods::unfiltered::{Interpolation, Unfiltered};
+use glints::methods::yan16::{self, Elements, Yan16};
 use glints::microfacet::Flake;
 use glints::normal_map::{self, Encoding};
 
@@ -78,8 +79,16 @@ mod ffi {
         masking_alpha_v: f32,
     }
 
+    #[derive(Clone, Copy)]
+    struct Yan16Options {
+        curved: bool,
+        refinement: u32,
+        footprint_sigma: f32,
+    }
+
     struct Statistics {
         method: String,
+        alpha: f32,
         structure_bytes: u64,
         build_seconds: f64,
         bins: u32,
@@ -100,7 +109,8 @@ mod ffi {
         type Brdf;
         fn inverse_bin_map(map: &Map, surface: Surface, bins: u32, leaf_size: u32) -> Result<Box<Brdf>>;
         fn direct(map: &Map, surface: Surface) -> Result<Box<Brdf>>;
-        fn unfiltered(map: &Map, surface: Surface) -> Result<Box<Brdf>>;
+        fn unfiltered(map: &Map, surface: Surface, bilinear: bool) -> Result<Box<Brdf>>;
+        fn yan16(map: &Map, surface: Surface, options: Yan16Options) -> Result<Box<Brdf>>;
         fn evaluate(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> Evaluation;
         fn pdf(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> f32;
         fn sample(self: &Brdf, footprint: Footprint, wi: Vector, u: [f32; 3]) -> Sample;
@@ -155,6 +165,7 @@ impl Map {
 /// A method over a map, and how long it took to build.
 pub struct Brdf {
     core: Core,
+    alpha: f32,
     build_seconds: f64,
 }
 
@@ -163,27 +174,72 @@ fn inverse_bin_map(map: &Map, surface: ffi::Surface, bins: u32, leaf_size: u32) 
         bins: (bins > 0).then_some(bins),
         leaf_size: (leaf_size > 0).then_some(leaf_size),
     };
-    build(map, surface, |model| {
-        Ok(Box::new(InverseBinMap::new(&map.0, model, options)?))
+    build(map, surface, || {
+        Ok(Box::new(InverseBinMap::new(&map.0, flakes(surface)?, options)?))
     })
 }
 
 fn direct(map: &Map, surface: ffi::Surface) -> Result<Box<Brdf>> {
-    build(map, surface, |model| {
-        Ok(Box::new(Direct::new(map.0.clone(), model)))
+    build(map, surface, || {
+        Ok(Box::new(Direct::new(map.0.clone(), flakes(surface)?)))
     })
 }
 
-fn unfiltered(map: &Map, surface: ffi::Surface) -> Result<Box<Brdf>> {
-    build(map, surface, |model| {
-        Ok(Box::new(Unfiltered::new(map.0.clone(), model)))
+fn unfiltered(map: &Map, surface: ffi::Surface, bilinear: bool) -> Result<Box<Brdf>> {
+    let interpolation = if bilinear {
+        Interpolation::Bilinear
+    } else {
+        Interpolation::Nearest
+    };
+    build(map, surface, || {
+        Ok(Box::new(Unfiltered::new(
+            map.0.clone(),
+            flakes(surface)?,
+            interpolation,
+        )))
+    })
+}
+
+fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result<Box<Brdf>> {
+    let options = yan16::Options {
+        elements: if options.curved {
+            Elements::Curved {
+                refinement: options.refinement,
+            }
+        } else {
+            Elements::Flat
+        },
+        intrinsic: surface.alpha / std::f32::consts::SQRT_2,
+        footprint_sigma: options.footprint_sigma,
+    };
+    build(map, surface, || {
+        if !surface.projected {
+            return Err(Error::Parameter {
+                name: "normalization",
+                value: "paper".into(),
+                reason: "a position-normal distribution is one of projected area; leave the parameter out"
+                    .into(),
+            });
+        }
+        Ok(Box::new(Yan16::new(&map.0, options)?))
+    })
+}
+
+fn flakes(surface: ffi::Surface) -> Result<FlakeModel> {
+    Ok(FlakeModel {
+        flake: Flake::new(surface.alpha)?,
+        normalization: if surface.projected {
+            Normalization::Projected
+        } else {
+            Normalization::Paper
+        },
     })
 }
 
 fn build(
     map: &Map,
     surface: ffi::Surface,
-    method: impl FnOnce(FlakeModel) -> Result<Box<dyn Method>>,
+    method: impl FnOnce() -> Result<Box<dyn Method>>,
 ) -> Result<Box<Brdf>> {
     let masking = match surface.masking {
         ffi::MaskingKind::Beckmann => Masking::Beckmann,
@@ -193,21 +249,20 @@ fn build(
         },
         _ => Masking::None,
     };
-    let normalization = if surface.projected {
-        Normalization::Projected
-    } else {
-        Normalization::Paper
-    };
     guarded("filename", map.0.name(), || {
-        let flake = Flake::new(surface.alpha)?;
         let mut build_seconds = 0.0;
         let core = Core::new(&map.0, masking, || {
             let start = Instant::now();
-            let method = method(FlakeModel { flake, normalization });
+            let method = method();
             build_seconds = start.elapsed().as_secs_f64();
             method
         })?;
-        Ok(Box::new(Brdf { core, build_seconds }))
+        let alpha = surface.alpha;
+        Ok(Box::new(Brdf {
+            core,
+            alpha,
+            build_seconds,
+        }))
     })
 }
 
@@ -254,6 +309,7 @@ impl Brdf {
         let method = self.core.method();
         ffi::Statistics {
             method: method.name().into(),
+            alpha: self.alpha,
             structure_bytes: method.structure_bytes() as u64,
             build_seconds: self.build_seconds,
             bins: method.bins().unwrap_or(0),

@@ -17,6 +17,7 @@ use glints::footprint::Footprint;
 use glints::methods::Method;
 use glints::methods::direct::Direct;
 use glints::methods::inverse_bin_map::{InverseBinMap, Options};
+use glints::methods::yan16::{self, Elements, Yan16};
 use glints::microfacet::Flake;
 use glints::normal_map::{Encoding, NormalMap};
 use serde_json::{Value, json};
@@ -56,15 +57,11 @@ fn measure(arguments: &Arguments, map: &NormalMap, alpha: f32) -> Result<()> {
     };
     let params = json!({ "map": arguments.label, "side": map.width(), "alpha": alpha });
     let direct = Direct::new(map.clone(), model);
-    let (ibm, build_seconds) = build(map, model)?;
-    print(
-        "ibm/memory",
-        ibm.structure_bytes() as f64,
-        "bytes",
-        paper_memory(alpha),
-        &params,
-    );
+    let (ibm, build_seconds) = timed(5, || InverseBinMap::new(map, model, Options::default()))?;
+    let bytes = ibm.structure_bytes() as f64;
+    print("ibm/memory", bytes, "bytes", paper_memory(alpha), &params);
     print("ibm/build", build_seconds, "seconds", paper_build(), &params);
+    measure_yan16(arguments, map, alpha, (bytes, build_seconds), &params)?;
     for &width in &arguments.width {
         let params = with(&params, &[("footprint", json!(width))]);
         let error = ndf_error(&ibm, &direct, width);
@@ -84,18 +81,67 @@ fn measure(arguments: &Arguments, map: &NormalMap, alpha: f32) -> Result<()> {
     Ok(())
 }
 
-/// The structure and the median of five construction times.
-fn build(map: &NormalMap, model: FlakeModel) -> Result<(InverseBinMap, f64)> {
+/// A structure and the median of its construction times.
+fn timed<T>(repetitions: usize, construct: impl Fn() -> Result<T>) -> Result<(T, f64)> {
     let mut times = Vec::new();
     loop {
         let start = Instant::now();
-        let ibm = InverseBinMap::new(map, model, Options::default())?;
+        let structure = construct()?;
         times.push(start.elapsed().as_secs_f64());
-        if times.len() == 5 {
+        if times.len() == repetitions {
             times.sort_by(f64::total_cmp);
-            return Ok((ibm, times[2]));
+            return Ok((structure, times[repetitions / 2]));
         }
     }
+}
+
+/// Memory, build time and evaluation of the position-normal mixtures, beside the inverse bin map's.
+fn measure_yan16(
+    arguments: &Arguments,
+    map: &NormalMap,
+    alpha: f32,
+    (ibm_bytes, ibm_seconds): (f64, f64),
+    params: &Value,
+) -> Result<()> {
+    for (kind, elements) in [
+        ("flat", Elements::Flat),
+        ("curved", Elements::Curved { refinement: 1 }),
+    ] {
+        let options = yan16::Options {
+            elements,
+            intrinsic: alpha / std::f32::consts::SQRT_2,
+            ..yan16::Options::default()
+        };
+        let params = with(params, &[("elements", json!(kind))]);
+        let (method, seconds) = timed(3, || Yan16::new(map, options))?;
+        let bytes = method.structure_bytes() as f64;
+        print("yan16/memory", bytes, "bytes", ("ibm", ibm_bytes), &params);
+        print("yan16/build", seconds, "seconds", ("ibm", ibm_seconds), &params);
+        let brdf = Brdf::new(map, Masking::Beckmann, || Ok(Box::new(method)))?;
+        let model = FlakeModel {
+            flake: Flake::new(alpha)?,
+            normalization: Normalization::Projected,
+        };
+        let ibm = InverseBinMap::new(map, model, Options::default())?;
+        let ibm = Brdf::new(map, Masking::Beckmann, || Ok(Box::new(ibm)))?;
+        for &width in &arguments.width {
+            let params = with(&params, &[("footprint", json!(width))]);
+            let queries = queries(&brdf, width, 256);
+            let eval = |brdf: &Brdf| {
+                nanoseconds(&queries, arguments.seconds, |q| {
+                    brdf.evaluate(&q.footprint, q.wi, q.wo).value
+                })
+            };
+            print(
+                "yan16/eval",
+                eval(&brdf),
+                "nanoseconds",
+                ("ibm", eval(&ibm)),
+                &params,
+            );
+        }
+    }
+    Ok(())
 }
 
 fn measure_queries(arguments: &Arguments, ibm: &Brdf, direct: &Brdf, width: f64, params: &Value) {

@@ -42,6 +42,7 @@ const POINT_LENGTH: f64 = 1e-9;
 #[derive(Clone, Copy, Debug)]
 pub struct Footprint {
     size: DVec2,
+    center: DVec2,
     texel: (u32, u32),
     region: Option<Parallelogram>,
 }
@@ -111,13 +112,33 @@ impl Footprint {
             e * size * (MAX_TILES / periods.max(MAX_TILES))
         };
         let region = Parallelogram::spanned(center, edge(duv_dx), edge(duv_dy));
-        Self { size, texel, region }
+        Self {
+            size,
+            center,
+            texel,
+            region,
+        }
     }
 
     /// A footprint given in texels: centre and edges.
     pub fn in_texels(width: u32, height: u32, center: DVec2, a: DVec2, b: DVec2) -> Self {
         let scale = |v: DVec2| [(v.x / f64::from(width)) as f32, (v.y / f64::from(height)) as f32];
         Self::new(width, height, scale(center), scale(a), scale(b))
+    }
+
+    /// Columns and rows of the map.
+    pub fn map_size(&self) -> DVec2 {
+        self.size
+    }
+
+    /// Centre in texels, inside the map.
+    pub fn center(&self) -> DVec2 {
+        self.center
+    }
+
+    /// Edges of the parallelogram in texels; zero for a point.
+    pub fn edges(&self) -> [DVec2; 2] {
+        self.region.map_or([DVec2::ZERO; 2], |region| region.edges)
     }
 
     /// Column and row of the texel under the centre.

@@ -13,6 +13,7 @@ pub mod brdf;
 pub mod error;
 pub mod flakes;
 pub mod footprint;
+pub mod gaussian_footprint;
 pub mod half_vector;
 pub mod methods;
 pub mod microfacet;

@@ -10,7 +10,7 @@
 
 use std::path::Path;
 
-use glam::{DVec2, Vec3};
+use glam::{DVec2, Vec2, Vec3};
 use image::{DynamicImage, ImageReader, Limits};
 
 use crate::error::{Error, Result};
@@ -162,6 +162,22 @@ impl NormalMap {
     /// The unit normal of the texel at `column < width`, `row < height`.
     pub fn normal(&self, column: u32, row: u32) -> Vec3 {
         self.normals[row as usize * self.width as usize + column as usize]
+    }
+
+    /// The projected normal (x, y) at a position in texels, interpolated bilinearly between the centres of
+    /// texels, with repetition. It lies inside the unit disk, as the disk is convex.
+    pub fn interpolated(&self, position: DVec2) -> Vec2 {
+        let p = position - 0.5;
+        let corner = p.floor();
+        let t = (p - corner).as_vec2();
+        let wrap = |i: f64, side: u32| i.rem_euclid(f64::from(side)) as u32 % side;
+        let projected = |dx: f64, dy: f64| {
+            let n = self.normal(wrap(corner.x + dx, self.width), wrap(corner.y + dy, self.height));
+            Vec2::new(n.x, n.y)
+        };
+        let low = projected(0.0, 0.0).lerp(projected(1.0, 0.0), t.x);
+        let high = projected(0.0, 1.0).lerp(projected(1.0, 1.0), t.x);
+        low.lerp(high, t.y)
     }
 
     /// Covariance of the slopes over all texels, in double precision.

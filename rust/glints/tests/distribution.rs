@@ -9,7 +9,8 @@ use glints::half_vector::DirectionPair;
 use glints::methods::Method;
 use glints::methods::direct::Direct;
 use glints::methods::inverse_bin_map::{InverseBinMap, Options, bins};
-use glints::methods::unfiltered::Unfiltered;
+use glints::methods::unfiltered::{Interpolation, Unfiltered};
+use glints::methods::yan16::{self, Elements, Yan16};
 use glints::microfacet::Flake;
 use glints::normal_map::NormalMap;
 
@@ -50,8 +51,30 @@ fn methods(map: &NormalMap, model: FlakeModel) -> Vec<Box<dyn Method>> {
     vec![
         Box::new(Direct::new(map.clone(), model)),
         Box::new(InverseBinMap::new(map, model, Options::default()).unwrap()),
-        Box::new(Unfiltered::new(map.clone(), model)),
+        Box::new(Unfiltered::new(map.clone(), model, Interpolation::Nearest)),
+        Box::new(yan16(map, model.flake.alpha(), Elements::Flat)),
     ]
+}
+
+fn yan16(map: &NormalMap, alpha: f32, elements: Elements) -> Yan16 {
+    let options = yan16::Options {
+        elements,
+        intrinsic: alpha / std::f32::consts::SQRT_2,
+        ..yan16::Options::default()
+    };
+    Yan16::new(map, options).unwrap()
+}
+
+/// A smooth map whose normal turns by about the roughness 0.05 from texel to texel.
+fn wavy_map(side: u32) -> NormalMap {
+    let phase = std::f32::consts::TAU * 3.0 / side as f32;
+    let normals: Vec<Vec3> = (0..side * side)
+        .map(|i| {
+            let (u, v) = ((i % side) as f32 * phase, (i / side) as f32 * phase);
+            Vec3::new(0.3 * (u + 0.5 * v.sin()).sin(), 0.25 * (v - u.cos()).cos(), 1.0)
+        })
+        .collect();
+    NormalMap::from_normals("wavy", side, side, &normals).unwrap()
 }
 
 /// Points of a grid over the projected hemisphere, and the projected solid angle of a cell.
@@ -212,6 +235,49 @@ fn samples_have_their_density() {
     }
 }
 
+#[test]
+fn samples_of_position_normal_mixtures_have_their_density() {
+    let map = wavy_map(64);
+    let refined = Elements::Curved { refinement: 2 };
+    for elements in [Elements::Flat, Elements::Curved { refinement: 1 }, refined] {
+        let method = yan16(&map, 0.05, elements);
+        // A point, less than a texel, some texels, several repetitions of the map, an even cover of it.
+        for width in [0.0, 0.5, 9.0, 70.0, 300.0] {
+            let footprint = footprint(64, width);
+            let grid = || (48, [0..48, 0..48]);
+            let exact = chi_square(&method, |h| method.density(&footprint, h), &footprint, grid(), 5);
+            assert!(is_plausible(exact), "{} width {width}: {exact:?}", method.name());
+            if width == 9.0 {
+                // Without the cosine it is another density.
+                let twin = chi_square(&method, |h| method.ndf(&footprint, h), &footprint, grid(), 5);
+                assert!(!is_plausible(twin), "{}: {twin:?}", method.name());
+            }
+        }
+    }
+}
+
+#[test]
+fn position_normal_mixtures_are_normalized() {
+    let map = wavy_map(64);
+    for elements in [
+        Elements::Flat,
+        Elements::Curved { refinement: 1 },
+        Elements::Curved { refinement: 3 },
+    ] {
+        let method = yan16(&map, 0.05, elements);
+        for width in [0.0, 0.5, 9.0, 70.0, 300.0] {
+            let (points, cell) = disk(160);
+            let footprint = footprint(64, width);
+            let integral: f64 = points.map(|h| f64::from(method.ndf(&footprint, h))).sum::<f64>() * cell;
+            assert!(
+                (integral - 1.0).abs() < 0.005,
+                "{} width {width}: {integral}",
+                method.name()
+            );
+        }
+    }
+}
+
 /// A map of one texel with the given slope, and the 7 x 7 bins around its normal.
 fn one_flake(slope: f32, alpha: f32, options: Options) -> (InverseBinMap, Footprint, [Range<usize>; 2]) {
     let normals = [Vec3::new(-slope, 0.3 * slope, 1.0)];
@@ -240,7 +306,7 @@ fn samples_of_nearly_specular_flakes_have_their_density() {
 fn the_test_tells_the_printed_density_from_the_exact_one() {
     // Eq. 18 as printed has no cosine of the sampled microfacet: that is the distribution itself.
     let map = NormalMap::from_normals("flake", 1, 1, &[Vec3::new(0.2, 0.1, 1.0)]).unwrap();
-    let method = Unfiltered::new(map, model(0.3, Normalization::Paper));
+    let method = Unfiltered::new(map, model(0.3, Normalization::Paper), Interpolation::Nearest);
     let footprint = Footprint::new(1, 1, [0.5; 2], [0.0; 2], [0.0; 2]);
     let grid = || (15, [0..15, 0..15]);
     let exact = chi_square(&method, |h| method.density(&footprint, h), &footprint, grid(), 24);
@@ -342,7 +408,8 @@ fn a_point_footprint_is_unfiltered() {
     let map = gaussian_map(16, [0.2, 0.2], 5);
     let model = model(0.1, Normalization::Projected);
     let point = Footprint::new(16, 16, [0.3, 0.7], [0.0; 2], [0.0; 2]);
-    let (direct, unfiltered) = (Direct::new(map.clone(), model), Unfiltered::new(map, model));
+    let unfiltered = Unfiltered::new(map.clone(), model, Interpolation::Nearest);
+    let direct = Direct::new(map, model);
     for h in disk(40).0 {
         assert_eq!(direct.ndf(&point, h), unfiltered.ndf(&point, h));
     }

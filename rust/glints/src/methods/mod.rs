@@ -3,6 +3,7 @@
 pub mod direct;
 pub mod inverse_bin_map;
 pub mod unfiltered;
+pub mod yan16;
 
 use glam::Vec3;
 

@@ -4,9 +4,12 @@
 //! to the true image with many samples per pixel, since averaging over a pixel's samples is the integral of
 //! Eq. 10; it is therefore the reference that filtered methods are held against.
 //!
+//! With [`Interpolation::Bilinear`] the normal is interpolated in the projected disk: the surface that curved
+//! elements of Yan et al. 2016 stand for, and the reference of methods that have it.
+//!
 //! **Layout** One unit normal a texel, 12 bytes.
 //!
-//! **Cost** One texel a query.
+//! **Cost** One texel a query; four of an interpolated map.
 
 use glam::Vec3;
 
@@ -14,22 +17,45 @@ use super::{Method, Reflection};
 use crate::flakes::FlakeModel;
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
-use crate::normal_map::NormalMap;
+use crate::normal_map::{MIN_Z, NormalMap};
+
+/// What the surface is between the centres of texels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Interpolation {
+    /// Piecewise flat: one normal a texel.
+    #[default]
+    Nearest,
+    /// [`NormalMap::interpolated`].
+    Bilinear,
+}
 
 pub struct Unfiltered {
     map: NormalMap,
     model: FlakeModel,
+    interpolation: Interpolation,
 }
 
 impl Unfiltered {
-    pub fn new(map: NormalMap, model: FlakeModel) -> Self {
-        Self { map, model }
+    pub fn new(map: NormalMap, model: FlakeModel, interpolation: Interpolation) -> Self {
+        Self {
+            map,
+            model,
+            interpolation,
+        }
     }
 
     #[inline]
     fn normal(&self, footprint: &Footprint) -> Vec3 {
-        let (column, row) = footprint.texel();
-        self.map.normal(column, row)
+        match self.interpolation {
+            Interpolation::Nearest => {
+                let (column, row) = footprint.texel();
+                self.map.normal(column, row)
+            }
+            Interpolation::Bilinear => {
+                let s = self.map.interpolated(footprint.center());
+                s.extend((1.0 - s.length_squared()).max(MIN_Z * MIN_Z).sqrt())
+            }
+        }
     }
 }
 
