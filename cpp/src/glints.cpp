@@ -121,8 +121,7 @@ Brdf Brdf::direct(const NormalMap &map, const SurfaceOptions &surface) {
 Brdf Brdf::unfiltered(const NormalMap &map, const SurfaceOptions &surface, Interpolation interpolation) {
     return translated([&] {
         bool bilinear = interpolation == Interpolation::Bilinear;
-        return Brdf(
-            std::make_unique<Impl>(Impl{bridge::unfiltered(*map.m_impl->map, to_bridge(surface), bilinear)}));
+        return Brdf(std::make_unique<Impl>(Impl{bridge::unfiltered(*map.m_impl->map, to_bridge(surface), bilinear)}));
     });
 }
 
@@ -157,8 +156,8 @@ float Brdf::ndf(const Footprint &footprint, const Vec3 &h) const noexcept {
 
 Statistics Brdf::statistics() const {
     auto s = m_impl->brdf->statistics();
-    return {std::string(s.method), s.alpha, s.structure_bytes,  s.build_seconds,
-            s.bins,                s.masking_alpha_u, s.masking_alpha_v};
+    return {std::string(s.method), s.alpha,          s.structure_bytes, s.build_seconds, s.bins,
+            s.masking_alpha_u,     s.masking_alpha_v};
 }
 
 } // namespace glints

@@ -86,7 +86,7 @@ enum class Interpolation : uint8_t {
 struct GLINTS_API Yan16Options {
     /// Curved elements follow the bilinearly interpolated map; flat ones have the texels' normals.
     bool curved = false;
-    uint32_t refinement = 1;      ///< curved elements per texel and side, 1 to 16
+    uint32_t refinement = 0;      ///< curved elements per texel and side, 1 to 16; 0: as many as the map needs, 1 or 2
     float footprint_sigma = 0.5f; ///< standard deviation of the Gaussian footprint in pixels, in [0.05, 4]
 };
 

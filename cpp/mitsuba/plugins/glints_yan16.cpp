@@ -19,7 +19,8 @@ The common ones are documented in `glints_ibm.cpp`. `normalization` can only be 
 |                   |         | projected disk. Instead of `alpha`, which is sqrt(2) times as large.                   |
 |                   |         | (Default: what `alpha` = 0.01 stands for, 0.00707)                                     |
 | `refinement`      | integer | Curved elements per texel and side: with more of them the mixture comes nearer to the  |
-|                   |         | interpolated map, at the square of memory and build time. (Default: 1)                 |
+|                   |         | interpolated map, at the square of memory and build time. 0: what the map needs, 1 if  |
+|                   |         | it is smooth from texel to texel, else 2. (Default: 0)                                 |
 | `footprint_sigma` | float   | Standard deviation of the Gaussian footprint in pixels. 0.5 is that of the published   |
 |                   |         | implementation; 0.29 has the variance of the pixel's box, is sharper and faster.       |
 |                   |         | (Default: 0.5)                                                                         |
@@ -61,7 +62,7 @@ static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::No
     options.curved = glints_mitsuba::choice_parameter(props, "elements", {"flat", "curved"}) == 1;
     options.footprint_sigma = props.get<float>("footprint_sigma", options.footprint_sigma);
     if (options.curved)
-        options.refinement = glints_mitsuba::unsigned_parameter(props, "refinement", 1);
+        options.refinement = glints_mitsuba::unsigned_parameter(props, "refinement", 0);
 
     glints::SurfaceOptions rough = surface;
     rough.alpha = glints_mitsuba::roughness_parameter(props, "intrinsic", std::sqrt(2.f), surface.alpha);

@@ -201,17 +201,6 @@ fn unfiltered(map: &Map, surface: ffi::Surface, bilinear: bool) -> Result<Box<Br
 }
 
 fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result<Box<Brdf>> {
-    let options = yan16::Options {
-        elements: if options.curved {
-            Elements::Curved {
-                refinement: options.refinement,
-            }
-        } else {
-            Elements::Flat
-        },
-        intrinsic: surface.alpha / std::f32::consts::SQRT_2,
-        footprint_sigma: options.footprint_sigma,
-    };
     build(map, surface, || {
         if !surface.projected {
             return Err(Error::Parameter {
@@ -221,6 +210,18 @@ fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result
                     .into(),
             });
         }
+        let elements = match (options.curved, options.refinement) {
+            (false, _) => Elements::Flat,
+            (true, 0) => Elements::Curved {
+                refinement: yan16::resolving_refinement(&map.0),
+            },
+            (true, refinement) => Elements::Curved { refinement },
+        };
+        let options = yan16::Options {
+            elements,
+            intrinsic: surface.alpha / std::f32::consts::SQRT_2,
+            footprint_sigma: options.footprint_sigma,
+        };
         Ok(Box::new(Yan16::new(&map.0, options)?))
     })
 }

@@ -43,7 +43,9 @@
 //!
 //! **Elements** *Flat* ones have the texels' normals: a piecewise flat surface, blurred by `sigma_h`. *Curved*
 //! ones follow the map interpolated bilinearly in the projected disk; `refinement` r puts r x r of them on a
-//! texel, and with it the mixture tends to the interpolated surface ([`NormalMap::interpolated`]).
+//! texel, and with it the mixture tends to the interpolated surface ([`NormalMap::interpolated`]). One a texel
+//! is enough for a map that is smooth at the scale of texels; over noise it misses what interpolation does to
+//! the variance of normals, and two a side are needed ([`resolving_refinement`]).
 //!
 //! **Layout** A [`tree::Tree`]: 14 bytes a texel for flat elements, 30 r^2 for curved ones.
 //!
@@ -58,6 +60,7 @@ mod tree;
 use std::f64::consts::TAU;
 
 use glam::{DVec2, Vec2, Vec3};
+use rayon::prelude::*;
 
 use super::{Method, Reflection};
 use crate::error::{Error, Result};
@@ -293,6 +296,29 @@ impl Method for Yan16 {
             Elements::Curved { .. } => "yan16 curved",
         }
     }
+}
+
+/// Curved elements per texel and side that a map needs: one where first differences of its normals outweigh
+/// the second ones, else two, which have bilinear interpolation's exact derivatives.
+pub fn resolving_refinement(map: &NormalMap) -> u32 {
+    let (width, height) = (map.width(), map.height());
+    let row_sums = |row: u32| {
+        let mut sums = DVec2::ZERO;
+        for column in 0..width {
+            let at = |dx: u32, dy: u32| projected(map.normal((column + dx) % width, (row + dy) % height));
+            let center = at(0, 0);
+            for (before, after) in [(at(width - 1, 0), at(1, 0)), (at(0, height - 1), at(0, 1))] {
+                let first = (after - before).length_squared();
+                let second = (after - 2.0 * center + before).length_squared();
+                sums += DVec2::new(first.into(), second.into());
+            }
+        }
+        sums
+    };
+    // Summed in the order of rows, so that the answer does not depend on the number of threads.
+    let rows: Vec<DVec2> = (0..height).into_par_iter().map(row_sums).collect();
+    let sums: DVec2 = rows.into_iter().sum();
+    if sums.y > sums.x { 2 } else { 1 }
 }
 
 fn projected(h: Vec3) -> Vec2 {

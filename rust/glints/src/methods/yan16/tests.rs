@@ -164,6 +164,19 @@ fn refined_curved_elements_tend_to_the_interpolated_map() {
 }
 
 #[test]
+fn noise_asks_for_more_elements_than_a_smooth_map() {
+    assert_eq!(resolving_refinement(&wavy_map(0.02)), 1);
+    let noise: Vec<Vec3> = (0..4096_u64)
+        .map(|i| {
+            let mut hash = Hash(i);
+            Vec3::new(hash.uniform() as f32 - 0.5, hash.uniform() as f32 - 0.5, 1.0)
+        })
+        .collect();
+    let noise = NormalMap::from_normals("noise", 64, 64, &noise).unwrap();
+    assert_eq!(resolving_refinement(&noise), 2);
+}
+
+#[test]
 fn parameters_outside_their_domain_are_refused() {
     let map = wavy_map(0.02);
     let message = |options: Options| Yan16::new(&map, options).map(|_| ()).unwrap_err().to_string();
