@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-FILTERED = ("glints_ibm", "glints_direct")
+FILTERED = ("glints_ibm", "glints_yan16", "glints_direct")
 BSDFS = FILTERED + ("glints_unfiltered",)
 NEEDS_DIFFERENTIALS = 0x20000  # BSDFFlags::NeedsDifferentials, which Mitsuba does not export to Python
 

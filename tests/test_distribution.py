@@ -37,6 +37,15 @@ def wavy_map(tmp_path_factory):
     return support.write_exr(tmp_path_factory.mktemp("maps") / "wavy.exr", normals)
 
 
+@pytest.fixture(scope="module")
+def smooth_map(tmp_path_factory):
+    """One period of a wave along u and v: the normal turns by 0.1 from texel to texel."""
+    u, v = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
+    slopes = [0.4 * np.sin(2 * np.pi * u / SIDE + 1), 0.4 * np.cos(2 * np.pi * (u + v) / SIDE)]
+    normals = support.unit(np.stack([*slopes, np.ones_like(u)], -1))
+    return support.write_exr(tmp_path_factory.mktemp("maps") / "smooth.exr", normals)
+
+
 def vertex(footprint, direction):
     duv_dx, duv_dy = FOOTPRINTS[footprint]
     return support.interaction((0.31, 0.77), DIRECTIONS[direction], duv_dx, duv_dy)
@@ -156,6 +165,20 @@ def test_sample_has_the_density_of_pdf(wavy_map, plugin, alpha, footprint, direc
     assert abs(estimate - integral) < 5 * error + 1e-3
     if footprint == "tiles":
         assert 0.75 < integral < 1.005
+
+
+@pytest.mark.parametrize("footprint", ["subtexel", "texels"])
+def test_curved_elements_sample_the_density_of_pdf(smooth_map, footprint):
+    bsdf = support.bsdf("glints_yan16", smooth_map, elements="curved", intrinsic=0.05)
+    si, bins = vertex(footprint, "oblique"), 40
+    probabilities = integrate_cells(si, bins, lambda wo: bsdf.pdf(CONTEXT, si, mi.Vector3f(*wo)))
+    probabilities = np.append(probabilities, max(0.0, 1 - probabilities.sum()))
+    counts, _ = draw_cells(bsdf, si, bins, 40_000, np.random.default_rng(2))
+    assert chi_square(counts, probabilities) > 1e-4
+    flat = support.bsdf("glints_yan16", smooth_map, intrinsic=0.05)
+    others, _ = draw_cells(flat, si, bins, 40_000, np.random.default_rng(2))
+    # Flat elements are another distribution: the twin that has to fail.
+    assert chi_square(others, probabilities) < 1e-12
 
 
 @pytest.mark.parametrize("plugin", support.FILTERED)

@@ -137,10 +137,35 @@ def test_bad_structure_parameter(rough_map, name, number):
     assert_mentions(message_of(lambda: bsdf("glints_ibm", rough_map, **{name: number})), "glints_ibm", name)
 
 
-@pytest.mark.parametrize("plugin", ["glints_direct", "glints_unfiltered"])
+@pytest.mark.parametrize("plugin", ["glints_yan16", "glints_direct", "glints_unfiltered"])
 @pytest.mark.parametrize("name", ["bins", "leaf_size"])
 def test_structure_parameters_belong_to_one_plugin(rough_map, plugin, name):
     assert_mentions(message_of(lambda: bsdf(plugin, rough_map, **{name: 4})), plugin, name)
+
+
+@pytest.mark.parametrize(
+    "parameters, fragments",
+    [
+        ({"alpha": 0.1, "intrinsic": 0.1}, ["alpha", "intrinsic", "exclude"]),
+        ({"intrinsic": 0.0}, ["intrinsic", "alpha / sqrt(2)"]),
+        ({"intrinsic": 1.0}, ["intrinsic", "0.707"]),
+        ({"elements": "round"}, ["elements", "flat", "curved"]),
+        ({"refinement": 2}, ["refinement"]),
+        ({"elements": "curved", "refinement": 17}, ["refinement", "1 to 16"]),
+        ({"elements": "curved", "refinement": -1}, ["refinement"]),
+        ({"footprint_sigma": 0.0}, ["footprint_sigma", "0.05"]),
+        ({"footprint_sigma": float("nan")}, ["footprint_sigma", "0.05"]),
+        ({"normalization": "paper"}, ["normalization", "projected area"]),
+    ],
+    ids=str,
+)
+def test_bad_parameter_of_position_normal_mixtures(rough_map, parameters, fragments):
+    assert_mentions(message_of(lambda: bsdf("glints_yan16", rough_map, **parameters)), "glints_yan16", *fragments)
+
+
+def test_bad_interpolation(rough_map):
+    message = message_of(lambda: bsdf("glints_unfiltered", rough_map, interpolation="cubic"))
+    assert_mentions(message, "glints_unfiltered", "interpolation", "nearest", "bilinear")
 
 
 @pytest.mark.parametrize("footprint", [-1.0, float("nan"), float("inf"), "pixels", "", "1 px", "-2"])

@@ -36,6 +36,9 @@ struct Arguments {
     /// Footprint widths in texels.
     #[arg(long, value_delimiter = ',', default_values_t = [1.0, 4.0, 16.0, 64.0, 256.0, 1024.0])]
     width: Vec<f64>,
+    /// Methods to measure, besides the direct sum: ibm, yan16.
+    #[arg(long, value_delimiter = ',', default_values_t = ["ibm".to_string(), "yan16".to_string()])]
+    methods: Vec<String>,
     /// Least time in seconds that a query cost is averaged over.
     #[arg(long, default_value_t = 0.05)]
     seconds: f64,
@@ -61,7 +64,9 @@ fn measure(arguments: &Arguments, map: &NormalMap, alpha: f32) -> Result<()> {
     let bytes = ibm.structure_bytes() as f64;
     print("ibm/memory", bytes, "bytes", paper_memory(alpha), &params);
     print("ibm/build", build_seconds, "seconds", paper_build(), &params);
-    measure_yan16(arguments, map, alpha, (bytes, build_seconds), &params)?;
+    if arguments.methods.iter().any(|name| name == "yan16") {
+        measure_yan16(arguments, map, model, (bytes, build_seconds), &params)?;
+    }
     for &width in &arguments.width {
         let params = with(&params, &[("footprint", json!(width))]);
         let error = ndf_error(&ibm, &direct, width);
@@ -95,21 +100,27 @@ fn timed<T>(repetitions: usize, construct: impl Fn() -> Result<T>) -> Result<(T,
     }
 }
 
+/// Widest footprint in texels of the position-normal mixtures, whose cost grows with the area.
+const WIDEST_YAN16: f64 = 256.0;
+
 /// Memory, build time and evaluation of the position-normal mixtures, beside the inverse bin map's.
 fn measure_yan16(
     arguments: &Arguments,
     map: &NormalMap,
-    alpha: f32,
+    model: FlakeModel,
     (ibm_bytes, ibm_seconds): (f64, f64),
     params: &Value,
 ) -> Result<()> {
+    let refinement = yan16::resolving_refinement(map);
+    let ibm = InverseBinMap::new(map, model, Options::default())?;
+    let ibm = Brdf::new(map, Masking::Beckmann, || Ok(Box::new(ibm)))?;
     for (kind, elements) in [
         ("flat", Elements::Flat),
-        ("curved", Elements::Curved { refinement: 1 }),
+        ("curved", Elements::Curved { refinement }),
     ] {
         let options = yan16::Options {
             elements,
-            intrinsic: alpha / std::f32::consts::SQRT_2,
+            intrinsic: model.flake.alpha() / std::f32::consts::SQRT_2,
             ..yan16::Options::default()
         };
         let params = with(params, &[("elements", json!(kind))]);
@@ -118,13 +129,7 @@ fn measure_yan16(
         print("yan16/memory", bytes, "bytes", ("ibm", ibm_bytes), &params);
         print("yan16/build", seconds, "seconds", ("ibm", ibm_seconds), &params);
         let brdf = Brdf::new(map, Masking::Beckmann, || Ok(Box::new(method)))?;
-        let model = FlakeModel {
-            flake: Flake::new(alpha)?,
-            normalization: Normalization::Projected,
-        };
-        let ibm = InverseBinMap::new(map, model, Options::default())?;
-        let ibm = Brdf::new(map, Masking::Beckmann, || Ok(Box::new(ibm)))?;
-        for &width in &arguments.width {
+        for &width in arguments.width.iter().filter(|&&width| width <= WIDEST_YAN16) {
             let params = with(&params, &[("footprint", json!(width))]);
             let queries = queries(&brdf, width, 256);
             let eval = |brdf: &Brdf| {

@@ -38,6 +38,8 @@
 //! * *Sampling.* A point of `G_P`, an element with probability proportional to its Gaussian there, and a
 //!   normal of the element's lobe at that point: exactly the density `D_P(h) (h . n)`, in constant time.
 //!   Where the truncation excludes the element from the density at the drawn normal, the draw fails.
+//! * *Lobes* are round in the projected disk, where Beckmann's are round about their normals: at a tilt theta
+//!   they are wider by 1 / cos theta across, of the same energy, and lower at their peak.
 //! * *Shadowing.* The flakes' own Smith term is one, as the half vector lies within the lobe; the whole
 //!   map's `G_x` is the same as everywhere ([`crate::brdf`]).
 //!
