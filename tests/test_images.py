@@ -1,126 +1,189 @@
-"""Images of both scenes: the filtered methods against an independent reference, and broken twins that must fail.
+"""Images of both scenes through every plugin, against stored references, and broken twins that must fail.
 
-The reference is `glints_unfiltered` at many samples: the same reflectance model without footprint or data structure. The checks ask three
-different questions, because no single one catches every fault: is the brightness right (means over blocks of pixels), are the glints
-where they belong (distance of the compressed images), and does filtering do its work (variance between seeds at few samples)?
+Two questions. Does a plugin still render what it rendered when its reference was stored? A few seeds are compared with
+the reference by the test of `glints_harness.imagediff`, which sees brightness, misplaced glints and lost filtering.
+And was that right? The stored references of the filters are held against that of the same surface without a filter,
+within stated biases; this takes no rendering. `./scripts/references` renders the references anew.
+
+docs/image-tests.md has a table of the broken twins; a test holds it against `TWINS`.
 """
 
-import dataclasses
+import re
 from pathlib import Path
 
-import generate
 import mitsuba as mi
 import numpy as np
 import pytest
-from glints_harness import methods, render, scenes
+import support
+import test_distribution
+from glints_harness.imagediff import cases, page, statistic, storage
+from glints_harness.imagediff.cases import CONFIGURATIONS, TEST_SEEDS
+from glints_harness.imagediff.text import describe
 
 ROOT = Path(__file__).resolve().parents[1]
 
-ALPHA = "0.02"  # heavy tails of smaller roughnesses would need a reference of minutes
-SIDE, BLOCK = 32, 16  # pixels of the crop and of a block
-SPP = 16
-SEEDS = range(32)
-REFERENCE_SPP, REFERENCE_SEEDS = 1024, range(100, 106)
+# Each configuration's share of a false alarm in a thousand runs of all of them, each with new seeds.
+ALPHA = 1 - (1 - statistic.ALPHA) ** (1 / len(CONFIGURATIONS))
 
-# Footprints of a pixel's size blur by up to a pixel on top of the pixel itself; the surface is taken as flat under them.
+
+def compared(configuration, name):
+    """The comparison of a configuration's renderings with the stored reference `name`."""
+    return statistic.compare(configuration.images(TEST_SEEDS), cases.stored(name), alpha=ALPHA)
+
+
+def assert_same(name, comparison, folder=ROOT / "out" / "imagediff"):
+    """Fail with a page to look at if a comparison finds a difference."""
+    if comparison.different:
+        left = Path(folder) / f"{name}.html"
+        settings = {"A": "this build", "B": f"stored reference {name}"}
+        page.write(left, [(name, comparison)], settings)
+        pytest.fail(f"{name} is {describe(comparison)}\nLook at {left}", pytrace=False)
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_images_are_those_of_the_stored_reference(name):
+    assert_same(name, compared(CONFIGURATIONS[name], name))
+
+
+def test_every_stored_reference_is_used():
+    assert {path.stem for path in cases.FOLDER.glob("*.exr")} == set(CONFIGURATIONS)
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_stored_reference_says_where_it_comes_from(name):
+    """Rendered with the settings of the tests, from a commit; `./scripts/references` sees to both."""
+    origin = storage.provenance_of(cases.FOLDER / f"{name}.exr")
+    assert re.fullmatch("[0-9a-f]{40}", origin["commit"]), f"{origin['commit']}: run ./scripts/references"
+    assert origin["spp"] == cases.SPP and origin["alpha"] == cases.ALPHA
+    assert origin["crop"] == list(CONFIGURATIONS[name].view().crop)
+    assert not set(range(origin["seeds"][0], origin["seeds"][1] + 1)) & set(TEST_SEEDS)
+
+
+# ---- the stored references against the surface without a filter -----------------------------------------------------
+
+BLOCK = 16
+# Footprints of a pixel's size blur by up to a pixel on top of the pixel itself; the surface is flat under them.
 STATED_BIAS = 0.05
-# Distance from the reference: measured 0.16 to 0.2; with bins shifted by three, 0.25 (shoes) and 0.4 (kettle).
-LARGEST_DISTANCE = {"shoes": 0.19, "kettle": 0.28}
-# Variance against unfiltered: measured 0.03 (shoes) and 0.35 (kettle, whose highlights are broad).
+# Variance of one seed against the unfiltered surface's.
 LARGEST_VARIANCE_RATIO = {"shoes": 0.15, "kettle": 0.6}
 
-
-@dataclasses.dataclass
-class Images:
-    """Grey images of several seeds, shape (seeds, SIDE, SIDE)."""
-
-    stack: np.ndarray
-
-    @property
-    def mean(self):
-        return self.stack.mean(0)
-
-    @property
-    def variance(self):
-        return self.stack.var(0, ddof=1).mean()
-
-    def blocks(self):
-        """Means of the blocks and their standard errors."""
-        count = SIDE // BLOCK
-        blocks = self.stack.reshape(-1, count, BLOCK, count, BLOCK).mean((2, 4))
-        return blocks.mean(0), blocks.std(0, ddof=1) / np.sqrt(len(blocks))
-
-    def compressed(self):
-        """The mean image with its highlights compressed, so that one bright glint does not decide a comparison."""
-        return self.mean / (0.3 + self.mean)
+FILTERED = [
+    # method, its surface without a filter, largest distance of the compressed mean images in both scenes
+    ("ibm-pixel", "unfiltered", 0.2),
+    ("direct", "unfiltered", 0.2),
+    # Its Gaussian, of half a pixel's standard deviation, is 1.7 times as wide as a pixel.
+    ("yan16-flat", "unfiltered", 0.26),
+    ("yan16-curved", "unfiltered-interpolated", 0.2),
+]
 
 
-class Crop:
-    """A small crop of a scene, at a view of 800 x 800 pixels."""
-
-    def __init__(self, scene):
-        self.scene = dataclasses.replace(scene, values={**scene.values, "alpha": ALPHA})
-        x, y, _, _ = scene.crops[0]
-        self.view = scenes.View("test", 800, 800, (x + 24, y + 24, SIDE, SIDE))
-        self.reference = self.images("glints_unfiltered", "pixel", REFERENCE_SPP, REFERENCE_SEEDS)
-        self.unfiltered = self.images("glints_unfiltered", "pixel")
-
-    def images(self, method, footprint, spp=SPP, seeds=SEEDS, normal_map=None):
-        scene = self.scene
-        if normal_map:
-            scene = dataclasses.replace(scene, values={**scene.values, "normalmap": str(normal_map)})
-        loaded = render.LoadedScene(scene.text(methods.METHODS[method], 1))
-        lighting = render.Lighting(footprint=footprint)
-        return Images(np.stack([loaded.render(self.view, lighting, spp, seed).image.mean(-1) for seed in seeds]))
-
-    def brightness_is_right(self, images):
-        """Every block's mean agrees within five standard errors plus the stated bias."""
-        (found, error), (expected, reference_error) = images.blocks(), self.reference.blocks()
-        allowed = 5 * np.hypot(error, reference_error) + STATED_BIAS * expected
-        return bool(np.all(np.abs(found - expected) < allowed))
-
-    def distance(self, images):
-        expected = self.reference.compressed()
-        return np.abs(images.compressed() - expected).mean() / expected.mean()
-
-    def glints_are_in_place(self, images):
-        return self.distance(images) < LARGEST_DISTANCE[self.scene.name]
-
-    def is_filtered(self, images):
-        return images.variance < LARGEST_VARIANCE_RATIO[self.scene.name] * self.unfiltered.variance
+def brightness(moments):
+    """The channels' mean over blocks, and its standard error."""
+    blocks = moments.blocks(None, statistic.Grid(moments.shape, BLOCK)).pick(moments.channels)
+    return blocks.means, np.sqrt(blocks.variances / blocks.count)
 
 
-@pytest.fixture(scope="module", params=["shoes", "kettle"])
-def crop(request):
-    mi.set_variant("scalar_rgb")
-    return Crop(scenes.find_scenes(ROOT / "mitsuba_scenes", [request.param], generate.ensure_assets)[0])
+def compressed(moments):
+    """The mean image with its highlights compressed, so that one bright glint does not decide a comparison."""
+    mean = moments.mean.mean(axis=-1)
+    return mean / (0.3 + mean)
 
 
-@pytest.mark.parametrize("method", ["glints_ibm", "glints_direct"])
-def test_filtered_images_agree_with_the_reference(crop, method):
-    images = crop.images(method, "pixel")
-    assert crop.brightness_is_right(images)
-    assert crop.glints_are_in_place(images), crop.distance(images)
-    assert crop.is_filtered(images), images.variance / crop.unfiltered.variance
+def distance(moments, truth):
+    return np.abs(compressed(moments) - compressed(truth)).mean() / compressed(truth).mean()
 
 
-def test_twin_without_footprint_is_caught(crop):
-    """The filter switched off: right on average, but as noisy as no filter."""
-    assert not crop.is_filtered(crop.images("glints_ibm", "0"))
+def variance(moments):
+    return moments.variances[..., : len(moments.channels)].mean()
 
 
-def test_twin_with_shifted_bins_is_caught(crop, tmp_path):
-    """All normals three bins away: about as bright, but the glints are elsewhere."""
-    twin = tmp_path / "shifted.exr"
-    normals = 2 * np.array(mi.Bitmap(str(crop.scene.normal_map)))[..., :3] - 1
-    normals[..., :2] += 3 * 2 / 235
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    mi.Bitmap((0.5 * (normals + 1)).astype(np.float32)).write(str(twin))
-    images = crop.images("glints_ibm", "pixel", normal_map=twin)
-    assert not (crop.brightness_is_right(images) and crop.glints_are_in_place(images)), crop.distance(images)
+def brightness_is_right(moments, truth):
+    """Every block's mean agrees within five standard errors plus the stated bias."""
+    (found, error), (expected, truth_error) = brightness(moments), brightness(truth)
+    return bool(np.all(np.abs(found - expected) < 5 * np.hypot(error, truth_error) + STATED_BIAS * expected))
 
 
-def test_twin_with_a_doubled_footprint_is_caught(crop):
-    """Footprints of two pixels: the glints are smeared."""
-    images = crop.images("glints_ibm", "2")
-    assert not (crop.brightness_is_right(images) and crop.glints_are_in_place(images)), crop.distance(images)
+@pytest.mark.parametrize("scene", ["shoes", "kettle"])
+@pytest.mark.parametrize("method, surface, largest_distance", FILTERED)
+def test_stored_filters_agree_with_the_unfiltered_surface(scene, method, surface, largest_distance):
+    moments, truth = (cases.stored(f"{scene}-{name}") for name in (method, surface))
+    assert brightness_is_right(moments, truth)
+    assert distance(moments, truth) < largest_distance
+    assert variance(moments) < LARGEST_VARIANCE_RATIO[scene] * variance(truth)
+
+
+@pytest.mark.parametrize("scene", ["shoes", "kettle"])
+def test_these_bounds_can_be_missed(scene):
+    """Footprints of two pixels are too far from the truth, no filter is too noisy, and a fifth is too bright."""
+    truth, wide, noisy = (
+        cases.stored(f"{scene}-{name}") for name in ("unfiltered", "ibm-2-pixels", "unfiltered-interpolated")
+    )
+    assert distance(wide, truth) > max(largest for _, _, largest in FILTERED)
+    assert variance(noisy) > LARGEST_VARIANCE_RATIO[scene] * variance(truth)
+    assert not brightness_is_right(brighter(truth, 1.2), truth)
+
+
+def brighter(moments, factor):
+    """A reference made brighter."""
+    return statistic.Moments(
+        moments.names, moments.means * factor, moments.variances * factor**2, moments.count, moments.scale
+    )
+
+
+# ---- broken twins ---------------------------------------------------------------------------------------------------
+
+TWINS = {
+    # fault: how the rendering is broken, the feature that has to tell
+    "filter off": (lambda base, _: base.with_footprint("0"), statistic.NOISE),
+    "footprint doubled": (lambda base, _: base.with_footprint("2"), statistic.PLACEMENT),
+    "bins shifted by one": (
+        lambda base, folder: base.with_map(cases.shifted_map(base.scene, 1, folder / "shifted.exr")),
+        statistic.BRIGHTNESS,
+    ),
+    "Fresnel dropped": (lambda base, _: base.with_parameters(material="none"), statistic.BRIGHTNESS),
+}
+
+
+@pytest.mark.parametrize("scene", ["shoes", "kettle"])
+@pytest.mark.parametrize("fault", TWINS)
+def test_broken_image_is_caught(fault, scene, tmp_path):
+    """A twin of `glints_ibm`, rendered through the plugins, is told from the stored reference by the feature named."""
+    name = f"{scene}-ibm-pixel"
+    broken, feature = TWINS[fault]
+    comparison = compared(broken(CONFIGURATIONS[name], tmp_path), name)
+    assert comparison.family_p(feature) < ALPHA, describe(comparison)
+    with pytest.raises(pytest.fail.Exception, match="Look at"):
+        assert_same(name, comparison, tmp_path)
+
+
+def test_broken_density_is_caught(rough_map):
+    """A twin whose `pdf` is off by the cosine of the outgoing direction fails the test that the plugin passes."""
+    bsdf = support.bsdf("glints_ibm", rough_map, alpha=0.16)
+    si = test_distribution.vertex("texels", "grazing")
+    bins = test_distribution.bins_per_side(0.16)
+    counts, _ = test_distribution.draw_cells(bsdf, si, bins, 20_000, np.random.default_rng(3))
+
+    def p_value(factor):
+        def density(wo):
+            return factor(wo) * bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(*wo))
+
+        found = test_distribution.integrate_cells(si, bins, density)
+        # What `pdf` leaves of one are samples below the horizon, which `sample` reports as failures.
+        return test_distribution.chi_square(counts, np.append(found, max(0.0, 1 - found.sum())))
+
+    assert p_value(lambda wo: 1.0) > 1e-4
+    # Also if the twin is normalised, so that only the shape of its density is wrong.
+    total = test_distribution.integrate_cells(
+        si, bins, lambda wo: wo[2] * bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(*wo))
+    ).sum()
+    failed = counts[-1] / counts.sum()
+    assert p_value(lambda wo: wo[2]) < 1e-12
+    assert p_value(lambda wo: wo[2] * (1 - failed) / total) < 1e-12
+
+
+def test_table_of_twins_is_true():
+    """docs/image-tests.md names every twin, the test that catches it, and by what."""
+    text = (ROOT / "docs" / "image-tests.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.+?) \| `tests/test_images.py::(\w+)` \| (.+?) \|", text, flags=re.MULTILINE)
+    expected = [(fault, test_broken_image_is_caught.__name__, feature) for fault, (_, feature) in TWINS.items()]
+    assert rows == [*expected, ("`pdf` off by a cosine", test_broken_density_is_caught.__name__, "chi-square")]
