@@ -1,136 +1,22 @@
 """The comparison harness: its metrics, its scenes, its references, its files, and a tiny comparison from end to end."""
 
+import argparse
+import csv
 import json
 import math
 import os
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as xml
 
 import numpy as np
 import pytest
 import support
-from glints_harness import bench, compare, files, images, metrics, reference, render, scenes
-from glints_harness.methods import GLINTS, METHODS, choose
-
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
-
-MINI_SCENE = """<scene version="3.0.0">
-    <default name="tiles" value="2"/>
-    <default name="folder" value="maps"/>
-    <default name="normalmap" value="$folder/flakes.exr"/>
-    <default name="alpha" value="0.1"/>
-    <bsdf type="normalmap" id="metal">
-        <texture name="normalmap" type="bitmap">
-            <string name="filename" value="$normalmap"/>
-            <boolean name="raw" value="true"/>
-            <string name="filter_type" value="nearest"/>
-            <transform name="to_uv"><scale x="$tiles" y="$tiles" z="1"/></transform>
-        </texture>
-        <bsdf type="roughconductor">
-            <string name="distribution" value="beckmann"/>
-            <string name="material" value="none"/>
-            <float name="alpha" value="$alpha"/>
-            <rgb name="specular_reflectance" value="0.9, 0.8, 0.7"/>
-        </bsdf>
-    </bsdf>
-    <shape type="rectangle"><ref id="metal"/></shape>
-    <emitter type="constant"><float name="radiance" value="0.2"/></emitter>
-    <emitter type="point">
-        <point name="position" x="1" y="1" z="3"/>
-        <float name="intensity" value="10"/>
-    </emitter>
-    <sensor type="perspective">
-        <float name="fov" value="40"/>
-        <transform name="to_world"><lookat origin="0, -2, 3" target="0, 0, 0" up="0, 0, 1"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="64"/>
-            <integer name="height" value="64"/>
-            <string name="pixel_format" value="rgb"/>
-            <rfilter type="box"/>
-        </film>
-    </sensor>
-</scene>
-"""
-
-
-def no_assets():
-    raise AssertionError("nothing is to be generated here")
-
-
-@pytest.fixture(scope="session")
-def mini_folder(tmp_path_factory):
-    """A folder with a scene that has a glint slot, its map, and a scene without slot."""
-    folder = tmp_path_factory.mktemp("scenes")
-    (folder / "maps").mkdir()
-    normals = support.random_normals(16, 16, 0.2)
-    support.write_exr(folder / "maps" / "flakes.exr", (normals + 1) / 2)
-    (folder / "mini.xml").write_text(MINI_SCENE, encoding="utf-8")
-    (folder / "plain.xml").write_text('<scene version="3.0.0"/>', encoding="utf-8")
-    return folder
-
-
-@pytest.fixture
-def mini(mini_folder):
-    """The scene with a slot."""
-    (scene,) = scenes.find_scenes(mini_folder, ["all"], no_assets)
-    return scene
-
-
-def a_reference(mean, standard_error):
-    """A reference of two batches with a given mean and standard error, both arrays."""
-    return reference.Reference(1, mean, 2 * standard_error**2, batches=2)
-
-
-# ---- metrics ---------------------------------------------------------------------------------------------------------
-
-
-def test_metrics_by_hand():
-    truth = np.zeros((1, 2, 3))
-    truth[0, 1] = 2
-    image = truth + [[[1, 1, 1], [-2, -2, -2]]]
-    assert metrics.rmse(image, truth) == pytest.approx(math.sqrt((1 + 4) / 2))
-    assert metrics.relmse(image, truth) == pytest.approx((1 / 0.01 + 4 / 4.01) / 2)
-    assert metrics.mean_error(image, truth) == pytest.approx(-0.5)
-    assert metrics.root_mean_square([1, 7]) == pytest.approx(5)
-    assert metrics.standard_error([1, 3]) == pytest.approx(1)
-    assert metrics.standard_error([1]) is None
-
-
-@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
-def test_bad_pixels_are_counted_and_not_replaced(bad):
-    truth = np.ones((2, 2, 3))
-    image = truth.copy()
-    image[0, 0, 1] = bad
-    found = metrics.errors(image, a_reference(truth, np.full_like(truth, 0.1)))
-    assert found["nonfinite"] == 1
-    assert not math.isfinite(found["rmse"]) and not math.isfinite(found["relmse"])
-    assert not math.isfinite(found["mean_error"])
-    assert not found["at_reference_noise"]
-    assert tuple(images.tone_map(image)[0, 0]) == images.INVALID_COLOUR
-
-
-def test_noise_of_the_reference():
-    truth = np.ones((4, 4, 3))
-    kept = a_reference(truth, np.full_like(truth, 0.1))
-    noise = metrics.reference_noise(kept)
-    assert noise["reference_rmse"] == pytest.approx(0.1)
-    assert noise["reference_relmse"] == pytest.approx(0.01 / 1.01)
-    assert noise["reference_mean_error"] == pytest.approx(0.1 / 4)
-    assert metrics.errors(truth + 0.13, kept)["at_reference_noise"]
-    assert not metrics.errors(truth + 0.15, kept)["at_reference_noise"]
-
-
-def test_batches_give_mean_and_standard_error():
-    view = scenes.View("crop1", 2, 2, (0, 0, 2, 2))
-    batches = np.random.default_rng(1).random((5, 2, 2, 3)).astype(np.float32)
-    kept = reference.Reference.empty(view)
-    for batch in batches:
-        kept.add(render.Rendering(batch, 1.0, 1.0))
-    np.testing.assert_allclose(kept.mean, batches.mean(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(kept.standard_error, batches.std(axis=0, ddof=1) / math.sqrt(5), rtol=1e-5)
-
+from glints_harness import bench, cli, compare, executors, files, images, maps, metrics, plan, render, scenes
+from glints_harness.methods import GLINTS, METHODS, check_plugins, choose
+from glints_harness.progress import Silent
+from glints_harness.summary import METRICS
+from mini import SCRIPTS, no_assets, run_compare
 
 # ---- scenes and methods ----------------------------------------------------------------------------------------------
 
@@ -168,6 +54,24 @@ def test_stock_methods_fill_the_slot(mini):
     plain = xml.fromstring(mini.text(METHODS["roughconductor"], 1)).find("bsdf")
     assert (kept.get("type"), kept.find("bsdf").get("type")) == ("normalmap", "roughconductor")
     assert (plain.get("type"), plain.get("id")) == ("roughconductor", "metal")
+    # 256 slopes of standard deviation 0.2 along each axis
+    for name in ("alpha_u", "alpha_v"):
+        widened = float(plain.find(f"float[@name='{name}']").get("value"))
+        assert widened == pytest.approx(math.sqrt(0.1**2 + 2 * 0.2**2), rel=0.1)
+    assert plain.find("float[@name='alpha']") is None
+
+
+def test_slopes_of_a_map(tmp_path):
+    slopes = np.zeros((2, 2, 2))
+    slopes[..., 0] = [[0.5, -0.5], [0.5, -0.5]]
+    slopes[..., 1] = 3
+    normals = support.unit(np.concatenate([-slopes, np.ones((2, 2, 1))], axis=-1))
+    support.write_exr(tmp_path / "map.exr", (normals + 1) / 2)
+    assert maps.slope_variances(tmp_path / "map.exr") == pytest.approx((0.25, 0), abs=1e-5)
+    assert maps.texels(tmp_path / "map.exr") == 4
+    support.write_exr(tmp_path / "flat.exr", np.full((2, 2, 3), 0.5, dtype=np.float32))
+    with pytest.raises(ValueError, match="z = 0"):
+        maps.slope_variances(tmp_path / "flat.exr")
 
 
 def test_a_method_overrides_what_the_slot_says(mini):
@@ -235,151 +139,186 @@ def test_json_spells_out_what_json_lacks(tmp_path):
     ]
 
 
-# ---- references ------------------------------------------------------------------------------------------------------
-
-
-def obtain(folder, scene, **wanted):
-    """The reference of a small crop with a store in `folder`, and how many batches were rendered for it."""
-    view = scenes.View("crop1", 64, 64, (24, 24, 16, 16))
-    rendered = []
-    store = reference.ReferenceStore(folder, METHODS["glints_unfiltered"])
-    found = store.obtain(scene, 1, view, render.Lighting("direct"), 0.01, tick=lambda: rendered.append(1), **wanted)
-    return found, len(rendered)
-
-
-def test_a_reference_is_kept_refined_and_bound_to_its_scene(mini, tmp_path, monkeypatch):
-    monkeypatch.setattr(reference, "BATCH_SAMPLES", 1000)
-    first, rendered = obtain(tmp_path, mini)
-    assert rendered == first.batches >= reference.FEWEST_BATCHES
-    again, rendered = obtain(tmp_path, mini)
-    assert rendered == 0
-    np.testing.assert_array_equal(again.mean, first.mean)
-    np.testing.assert_array_equal(again.standard_error, first.standard_error)
-    finer, rendered = obtain(tmp_path, mini, spp=first.spp + 1)
-    assert (rendered, finer.batches) == (1, first.batches + 1)
-    support.write_exr(mini.normal_map, (support.random_normals(16, 16, 0.2, seed=2) + 1) / 2)
-    try:
-        assert obtain(tmp_path, mini)[1] >= reference.FEWEST_BATCHES
-    finally:
-        support.write_exr(mini.normal_map, (support.random_normals(16, 16, 0.2) + 1) / 2)
-
-
-def test_an_interrupted_reference_goes_on_where_it_stopped(mini, tmp_path, monkeypatch):
-    monkeypatch.setattr(reference, "BATCH_SAMPLES", 1000)
-    whole, _ = obtain(tmp_path / "whole", mini, spp=30)
-    calls = []
-
-    def interrupt(*arguments):
-        calls.append(arguments)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return plain(*arguments)
-
-    plain = render.LoadedScene.render
-    monkeypatch.setattr(render.LoadedScene, "render", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        obtain(tmp_path / "parts", mini, spp=30)
-    monkeypatch.setattr(render.LoadedScene, "render", plain)
-    resumed, rendered = obtain(tmp_path / "parts", mini, spp=30)
-    assert rendered == whole.batches - 3
-    np.testing.assert_allclose(resumed.mean, whole.mean, rtol=1e-12)
-
-
 # ---- end to end ------------------------------------------------------------------------------------------------------
 
-
-def run_compare(folder, out, cache, *options):
-    """Run `scripts/compare` without its set-up, in a process of its own; returns what it printed."""
-    command = [sys.executable, "-m", "glints_harness.cli", "--scene-dir", str(folder), "--res", "32"]
-    command += ["--out", str(out), "--cache", str(cache), *options]
-    environment = {**os.environ, "PYTHONPATH": str(SCRIPTS)}
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+OPTIONS = (
+    "--tiling",
+    "2",
+    "--spp",
+    "1,4",
+    "--seeds",
+    "2",
+    "--reference-spp",
+    "100",
+    "--sweep",
+    "2,4",
+    "--frames",
+    "3",
+)
 
 
 @pytest.fixture(scope="session")
 def comparison(mini_folder, tmp_path_factory):
-    """A tiny comparison of all methods: its folder, its cache, its records."""
+    """A tiny comparison of all methods: its folder, its cache, its results."""
     out, cache = tmp_path_factory.mktemp("out"), tmp_path_factory.mktemp("cache")
-    options = ("--tiling", "2", "--spp", "1,4", "--seeds", "2", "--reference-spp", "100")
-    done = run_compare(mini_folder, out, cache, *options)
+    done = run_compare(mini_folder, out, cache, *OPTIONS)
     assert done.returncode == 0, done.stderr
     assert str(out / "index.html") in done.stdout.replace("\n", "")
+    assert "glints_yan16_flat takes" in " ".join(done.stdout.split())
     return out, cache, json.loads((out / "results.json").read_text(encoding="utf-8"))
 
 
+def curves():
+    """Every method with its footprint rules."""
+    return [
+        (name, rule)
+        for name, method in METHODS.items()
+        for rule in (("sample", "pixel") if name == "glints_ibm" else ("sample",) if method.filters else ("none",))
+    ]
+
+
 def test_results_list_every_run(comparison):
-    out, _, records = comparison
-    crops = [record for record in records if record["view"] != "frame"]
-    frames = [record for record in records if record["view"] == "frame"]
-    runs = {(record["method"], record["view"], record["spp"], record["seed"]) for record in crops}
-    assert runs == {
-        (m, v, spp, seed) for m in METHODS for v in ("crop1", "crop2") for spp in (1, 4) for seed in (1, 2)
+    out, _, results = comparison
+    records = results["records"]
+    found = {
+        (record["method"], record["footprint"], record["view"], record["spp"], record["seed"])
+        for record in records
+        if record["tiling"] == 2 and record["frame"] is None
     }
-    assert sorted(record["method"] for record in frames) == sorted(METHODS)
+    crops = {
+        (*curve, v, spp, seed) for curve in curves() for v in ("crop1", "crop2") for spp in (1, 4) for seed in (1, 2)
+    }
+    assert found == crops | {(*curve, "frame", 4, 1) for curve in curves()}
+    texels = [curve for curve in curves() if METHODS[curve[0]].surface == "texels"]
+    sequence = [
+        (record["method"], record["footprint"], record["frame"]) for record in records if record["frame"] is not None
+    ]
+    assert sequence == [(*curve, frame) for curve in texels for frame in range(3)]
+    sweep = {(item["method"], item["footprint"], item["tiling"]) for item in results["sweep"]}
+    assert sweep == {(*curve, tiling) for curve in texels for tiling in (2, 4)}
     for record in records:
-        assert (record["scene"], record["tiling"], record["footprint"]) == ("mini", 2, "sample")
-        assert all(record[key] > 0 for key in ("seconds", "cpu_seconds", "rmse", "relmse", "reference_rmse"))
-        assert math.isfinite(record["mean_error"]) and record["nonfinite"] == 0
+        assert record["seconds"] > 0 and record["cpu_seconds"] > 0 and record["nonfinite"] == 0
         assert (out / record["image"]).is_file()
+        assert results["provenances"][record["provenance"]]["plugins"] == results["provenance"]["plugins"]
+        if record["view"] != "frame" and record["frame"] is None:
+            assert all(math.isfinite(record[name]) for name in METRICS)
     sizes = {record["method"]: record["structure_bytes"] for record in records}
     assert sizes["glints_ibm"] > 0 and sizes["normalmap"] is None
+    with open(out / "results.csv", encoding="utf-8", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [row["image"] for row in table] == [record["image"] for record in records]
+    assert float(table[0]["rmse"]) == records[0]["rmse"]
 
 
-def test_an_image_on_disk_gives_the_listed_error(comparison):
-    out, cache, records = comparison
-    record = next(item for item in records if item["view"] == "crop1" and item["method"] == "glints_direct")
-    (path,) = (cache / "references").glob("mini-x2-crop1-*.npz")
-    kept = np.load(path)
-    assert json.loads(str(kept["provenance"]))["method"] == "glints_unfiltered"
-    assert metrics.rmse(images.read_exr(out / record["image"]), kept["mean"]) == pytest.approx(record["rmse"])
+def test_an_image_on_disk_gives_the_listed_errors(comparison):
+    out, cache, results = comparison
+    for method, surface in (
+        ("glints_direct", "texels"),
+        ("glints_ibm_rough", "rough"),
+        ("glints_yan16_curved", "interpolated"),
+    ):
+        mine = [item for item in results["summaries"] if item["method"] == method and item["view"] == "crop1"]
+        summary = next(item for item in mine if item["spp"] == 4)
+        assert summary["surface"] == surface
+        (path,) = (cache / "references").glob(f"mini-x2-crop1-{surface}-*.npz")
+        truth = np.load(path)["mean"]
+        records = [
+            record
+            for record in results["records"]
+            if (record["method"], record["tiling"], record["view"], record["spp"], record["frame"])
+            == (method, 2, "crop1", 4, None)
+        ]
+        measured = [metrics.rmse(images.read_exr(out / record["image"]), truth) for record in records]
+        assert measured == pytest.approx([record["rmse"] for record in records])
+        assert summary["errors"]["rmse"]["total"]["value"] == pytest.approx(np.sqrt(np.mean(np.square(measured))))
+        mean = np.mean([images.read_exr(out / record["image"]) for record in records], axis=0)
+        np.testing.assert_allclose(images.read_exr(out / summary["mean_image"]), mean, rtol=1e-6)
 
 
 def test_methods_of_one_model_have_the_mean_of_the_reference(comparison):
-    _, _, records = comparison
-    relative = {
-        record["method"]: abs(record["mean_error"]) / record["mean_reference"]
-        for record in records
-        if record["view"] == "frame"
-    }
-    # 16 samples in each of 1024 pixels give about 1 %; without the map it is 41 %.
-    assert all(relative[name] < 0.05 for name, method in METHODS.items() if method.model == GLINTS), relative
-    assert relative["roughconductor"] > 0.2
+    out, cache, results = comparison
+    (path,) = (cache / "references").glob("mini-x2-frame-texels-*.npz")
+    truth = np.load(path)["mean"].mean()
+    frames = [record for record in results["records"] if record["view"] == "frame"]
+    means = {record["method"]: images.read_exr(out / record["image"]).mean() / truth for record in frames}
+    alike = [name for name, method in METHODS.items() if method.model == GLINTS and method.surface == "texels"]
+    # 4 samples in each of 1024 pixels give about 2 %. Flakes seven times as rough are another surface.
+    assert all(abs(means[name] - 1) < 0.08 for name in alike), means
 
 
-def test_the_report_shows_every_method_and_needs_no_other_file(comparison):
+def test_the_report_shows_every_method(comparison):
     out, _, _ = comparison
     page = (out / "index.html").read_text(encoding="utf-8")
-    assert all(name in page for name in METHODS)
-    assert "data:image/png;base64," in page and "data:image/svg+xml;base64," in page
-    assert 'src="http' not in page and 'src="runs' not in page
+    assert all(method.label in page for method in METHODS.values())
     assert not [name for name in out.rglob(".unfinished-*")]
 
 
-def test_a_second_comparison_reuses_the_references(comparison, mini_folder, tmp_path):
+def test_a_second_comparison_reuses_what_is_kept(comparison, mini_folder, tmp_path):
     _, cache, _ = comparison
-    kept = {path: path.stat().st_mtime_ns for path in (cache / "references").iterdir()}
-    options = ("--tiling", "2", "--time", "0.05", "--seeds", "1", "--reference-spp", "100", "--methods", "normalmap")
-    done = run_compare(mini_folder, tmp_path, cache, *options)
+    kept = {path: path.stat().st_mtime_ns for path in cache.rglob("*") if path.is_file()}
+    options = (
+        "--time",
+        "0.02",
+        "--seeds",
+        "1",
+        "--methods",
+        "normalmap",
+        "--sweep",
+        "none",
+        "--frames",
+        "0",
+        "--no-report",
+    )
+    done = run_compare(mini_folder, tmp_path, cache, *OPTIONS[:2], *OPTIONS[6:8], "--spp", "4", *options)
     assert done.returncode == 0, done.stderr
-    assert kept == {path: path.stat().st_mtime_ns for path in (cache / "references").iterdir()}
-    timed = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
-    assert {record["time_budget"] for record in timed if record["view"] != "frame"} == {0.05}
+    now = {path: path.stat().st_mtime_ns for path in cache.rglob("*") if path.is_file()}
+    assert {path: now[path] for path in kept} == kept
+    # an image and its description for each of two crops in equal time; all else is there
+    assert len(now) - len(kept) == 4
+    records = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["records"]
+    assert sorted(record["time_budget"] or 0 for record in records) == [0, 0, 0, 0.02, 0.02]
 
 
-def test_mistakes_on_the_command_line_are_named(mini_folder, tmp_path):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--methods", "yan"), "unknown method yan; there are"),
+        (("--footprint", "pixel", "--integrator", "path"), "needs the integrator glints_path"),
+        (("--dask", "tcp://127.0.0.1:9", "--limit", "9"), "leave it out with --dask"),
+    ],
+)
+def test_options_that_contradict_each_other_are_named(mini_folder, options, message):
+    with pytest.raises(ValueError, match=message):
+        cli.settings(cli.parser().parse_args(["--scene-dir", str(mini_folder), *options]))
+
+
+@pytest.mark.parametrize(("text", "rules"), [("sample", ("sample",)), ("pixel,0.50,2", ("pixel", "0.5", "2"))])
+def test_footprint_rules(text, rules):
+    assert cli.rules(text) == rules
+    with pytest.raises(argparse.ArgumentTypeError, match="not a footprint rule"):
+        cli.rules(text + ",wide")
+
+
+def test_mistakes_end_in_one_line(mini_folder, tmp_path):
     done = run_compare(mini_folder, tmp_path, tmp_path, "--scene", "teapot")
     assert done.returncode != 0
     assert "no scene teapot" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_slow_runs_are_left_out_and_said_so(mini, tmp_path):
+def test_a_method_without_its_plugin_is_refused(monkeypatch):
+    lacking = replace(METHODS["glints_ibm"], plugins=("glints_nowhere",))
+    with pytest.raises(ValueError, match="plugin glints_nowhere is not installed; .* leave out glints_ibm"):
+        check_plugins([METHODS["glints_direct"], lacking])
+
+
+def test_slow_points_are_left_out_and_said_so(mini, tmp_path):
     said = []
 
-    class Quiet:
-        expect = advance = staticmethod(lambda seconds: None)
-        say = staticmethod(said.append)
+    class Quiet(Silent):
+        def say(self, text):
+            said.append(text)
 
-    settings = compare.Settings(
+    settings = plan.Settings(
         scenes=(mini,),
         methods=(METHODS["roughconductor"],),
         tilings=(1,),
@@ -389,15 +328,13 @@ def test_slow_runs_are_left_out_and_said_so(mini, tmp_path):
         frame_size=16,
         lighting=render.Lighting("direct"),
         reference_spp=1,
-        reference_method=METHODS["normalmap"],
-        limit=20.0,
+        limit=60.0,
         out=tmp_path,
         cache=tmp_path,
     )
-    comparison = compare.Comparison(settings, Quiet)
-    comparison.run()
-    assert {(item["view"], item["spp"]) for item in comparison.left_out} == {("crop1", 10**9), ("crop2", 10**9)}
-    assert {record["spp"] for record in comparison.records if record["view"] != "frame"} == {1}
+    results = compare.Comparison(settings, executors.Local(), Quiet(), {}).run()
+    assert {(item["view"], item["spp"]) for item in results.left_out} == {("crop1", 10**9), ("crop2", 10**9)}
+    assert {record["spp"] for record in results.records if record["view"] != "frame"} == {1}
     assert "mini x1: roughconductor" in said
 
 

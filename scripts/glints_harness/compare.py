@@ -1,240 +1,244 @@
-"""The comparison: every method on every scene, tiling and view, each image measured against the reference."""
+"""The comparison: every method on every scene, tiling and view, each image measured against its surface's reference.
+
+The plan's runs are gathered into jobs that load one scene with one method once. What the caches hold is taken from there; an
+executor carries out the rest. Every result is kept the moment it arrives, so that an interrupted comparison goes on
+where it stopped. Errors are measured at the end, from the images.
+"""
 
 import math
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
 
-import mitsuba as mi
+from . import measure, provenance, temporal
+from .files import Damaged, duplicate, write_csv, write_exr, write_json
+from .jobs import LeftOut, Part, ReferenceJob, RenderJob, Wanted
+from .methods import SURFACES
+from .plan import ReferenceKey, RunPlan, Settings, Texts, is_measured, references
+from .reference import Reference, ReferenceStore
+from .runs import RunCache, description
+from .summary import Results
 
-from . import metrics
-from .files import replacing, write_json
-from .methods import REFERENCE, Method
-from .reference import ReferenceStore, batch_spp
-from .render import Lighting, LoadedScene, Run
+__all__ = ["Comparison", "Settings"]
 
-FIRST_SEED = 1
-"""Seeds of measured runs count up from here; those of the reference lie far away."""
-
-GUESSED_SAMPLE_SECONDS = 1.5e-6
-"""Wall-clock time of one sample, for the progress display until the real one is known."""
-
-LARGEST_FRAME_SHARE = 1 / 8
-"""A frame that is predicted to take a larger share of the whole limit is left out."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What to compare. Sizes in pixels, times in seconds."""
-
-    scenes: tuple
-    methods: tuple
-    tilings: tuple = (1, 8)
-    spps: tuple = (1, 4, 16, 64)
-    times: tuple = ()
-    seeds: int = 3
-    size: int = 800
-    """Width and height of the frame that the crops are cut from."""
-    frame_size: int = 400
-    frame_spp: int = 16
-    lighting: Lighting = field(default_factory=Lighting)
-    """Of the crops: direct light, which is what the methods filter, unless asked for otherwise."""
-    frame_depth: int = 3
-    """Longest path of the frames, which are there to be looked at."""
-    reference_seconds: float = 8.0
-    """Least rendering time of a crop's reference; a frame's has a third."""
-    reference_spp: int = None
-    reference_method: Method = REFERENCE
-    limit: float = None
-    """Seconds for the whole comparison; None: no limit. A method gets its share of what is left; runs that are
-    predicted to exceed it get fewer seeds, or are left out."""
-    out: Path = Path("out/compare")
-    cache: Path = Path(".cache/references")
-
-    def lighting_of(self, view):
-        """The integrator of a view."""
-        return replace(self.lighting, max_depth=self.frame_depth) if is_frame(view) else self.lighting
-
-
-def is_frame(view):
-    """Whether a view is the whole film."""
-    return view.name == "frame"
+REPORT_SECONDS = 25.0
+"""Kept back from the time limit for what follows the measurements."""
 
 
 class Comparison:
-    """Carries out a comparison, and writes its records after every method."""
+    """Carries out a comparison."""
 
-    def __init__(self, settings, progress):
-        """`progress` has `expect(seconds)`, `advance(seconds)` and `say(text)`."""
-        self.settings = settings
-        self.progress = progress
-        self.store = ReferenceStore(settings.cache, settings.reference_method)
-        self.records = []
-        self.left_out = []
+    def __init__(self, settings, executor, progress, warnings):
+        """`executor` as in `executors`; `progress` has `expect(seconds)`, `advance(seconds)`, `say(text)`; `warnings`
+        counts messages."""
+        self.settings, self.executor, self.progress, self.warnings = settings, executor, progress, warnings
+        self.plan = RunPlan(settings)
+        self.store = ReferenceStore(settings.cache / "references")
+        self.cache = RunCache(settings.cache / "runs", settings.fresh)
+        self.texts = Texts()
         self.references = {}
-        self.case_reference_seconds = 0.0
+        """`ReferenceKey` to `Reference`."""
+        self.records = {}
+        """`Run` to record, flat."""
+        self.provenances = {}
+        """What records name by a digest."""
+        self.left_out = []
+        self.image_seconds = measure.image_seconds(settings, executor.machine["cores"])
         self.start = time.perf_counter()
 
     def run(self):
-        """Do everything; returns the records."""
-        cases = [(scene, tiling) for scene in self.settings.scenes for tiling in self.settings.tilings]
-        self.progress.expect(len(cases) * self.expected_seconds())
-        waiting = len(cases) * len(self.settings.methods)
-        for scene, tiling in cases:
-            views = scene.views(self.settings.size, self.settings.frame_size)
-            self.obtain_references(scene, tiling, views.values())
-            for method in self.settings.methods:
-                self.progress.say(f"{scene.name} x{tiling:g}: {method.name}")
-                MethodRuns(self, scene, tiling, method, views, self.share(waiting)).run()
-                self.write_records()
-                waiting -= 1
-        return self.records
+        """Render what is missing, and measure everything; returns `Results`, which then are in the output folder, too."""
+        self.render()
+        self.progress.say("errors")
+        self.records = {run: self.records[run] for run in self.plan.runs if run in self.records}
+        found = measure.summaries(self)
+        for key, reference in self.references.items():
+            write_exr(self.settings.out / "runs" / key.file_name, reference.mean)
+        results = Results(
+            settings=self.settings,
+            summaries=measure.of_points(found, self.plan.main),
+            records=list(self.records.values()),
+            references={
+                (key.scene, key.tiling, key.surface, key.view.name): reference
+                for key, reference in self.references.items()
+                if key.view.frame is None
+            },
+            sweep=measure.of_points(found, self.plan.sweep),
+            temporal=temporal.results(self),
+            left_out=self.left_out,
+            provenance=provenance.provenance(),
+            warnings=self.warnings,
+            exposure=0.0,
+            seconds=time.perf_counter() - self.start,
+            out=self.settings.out,
+        )
+        self.write(results)
+        return results
 
-    def obtain_references(self, scene, tiling, views):
-        """The references of one scene at one tiling, and how long it took to get them."""
-        start = time.perf_counter()
-        for view in views:
-            self.progress.say(f"{scene.name} x{tiling:g}: reference of {view.name}")
-            self.references[scene.name, tiling, view.name] = self.reference(scene, tiling, view)
-        self.case_reference_seconds = time.perf_counter() - start
+    def render(self):
+        """Render what is missing; afterwards `records`, `references` and `left_out` are complete."""
+        reference_jobs, render_jobs = self.reference_jobs(), self.render_jobs()
+        expected = sum(job.expected_seconds for job in (*reference_jobs, *render_jobs))
+        self.progress.expect(expected + self.image_seconds * len(self.plan.runs) + REPORT_SECONDS)
+        self.carry_out(reference_jobs, lambda _jobs: math.inf)
+        self.carry_out(render_jobs, self.share)
 
-    def reference(self, scene, tiling, view):
-        """The reference of one view."""
-        settings = self.settings
-        seconds = settings.reference_seconds / (3 if is_frame(view) else 1)
-        step = view.pixels * batch_spp(view) * GUESSED_SAMPLE_SECONDS
-        lighting, spp = settings.lighting_of(view), settings.reference_spp
-        return self.store.obtain(scene, tiling, view, lighting, seconds, spp, lambda: self.progress.advance(step))
+    def carry_out(self, jobs, share):
+        """Hand jobs to the executor, and keep what comes back."""
+        waiting = list(jobs)
 
-    def share(self, waiting):
-        """Seconds for the next of `waiting` methods, so that the rest fits the limit, too, if it is alike."""
-        settings = self.settings
-        if settings.limit is None:
+        def finished(job):
+            waiting.remove(job)
+            self.write_records()
+            self.progress.advance(job.expected_seconds)
+            if waiting:
+                self.progress.say(waiting[0].name)
+
+        if jobs:
+            self.progress.say(jobs[0].name)
+            self.executor.execute(jobs, self.receive, finished, share)
+
+    def share(self, jobs):
+        """Seconds for the first of the jobs that are left, by their expected times."""
+        if self.settings.limit is None:
             return math.inf
-        later_cases = (waiting - 1) // len(settings.methods)
-        left = settings.limit - (time.perf_counter() - self.start) - later_cases * self.case_reference_seconds
-        return max(0.0, left / waiting)
+        owed = REPORT_SECONDS + self.image_seconds * sum(is_measured(run.view) for run in self.records)
+        left = self.settings.limit - owed - (time.perf_counter() - self.start)
+        return max(0.0, left) * jobs[0].expected_seconds / sum(job.expected_seconds for job in jobs)
 
-    def expected_seconds(self):
-        """A guess at the time of one scene and tiling, for the progress display."""
-        settings = self.settings
-        crop_pixels, frame_pixels = 2 * (settings.size / 10) ** 2, settings.frame_size**2
-        samples = settings.seeds * sum(settings.spps) * crop_pixels + settings.frame_spp * frame_pixels
-        timed = 2 * settings.seeds * sum(settings.times)
-        references = (2 + 1 / 3) * settings.reference_seconds
-        if settings.reference_spp is not None:
-            references = settings.reference_spp * (crop_pixels + frame_pixels) * GUESSED_SAMPLE_SECONDS
-        return len(settings.methods) * (samples * GUESSED_SAMPLE_SECONDS + timed) + references
+    def receive(self, outcome):
+        """Keep one result."""
+        if isinstance(outcome, Part):
+            self.store.keep(self.describe_reference(outcome.key), outcome.reference)
+            self.references[outcome.key] = outcome.reference
+        elif isinstance(outcome, LeftOut):
+            predicted = {"reason": outcome.reason, "predicted_seconds": outcome.predicted_seconds}
+            self.left_out.append({**outcome.run.record(), **predicted})
+        else:
+            self.list_run(outcome.run, self.cache.keep(self.describe(outcome.run), outcome))
+
+    def recover(self, find, *arguments):
+        """What `find` finds; what is damaged is reported, and counts as missing."""
+        try:
+            return find(*arguments)
+        except Damaged as damage:
+            message = f"damaged, rendered again: {damage}"
+            self.warnings[message] = self.warnings.get(message, 0) + 1
+            self.progress.say(message)
+            return None
+
+    # ---- references --------------------------------------------------------------------------------------------------
+
+    def reference_jobs(self):
+        """A job for each scene, tiling and surface that lacks something; what is complete comes from the store."""
+        settings, groups = self.settings, {}
+        for key, share in references(settings):
+            kept = self.recover(self.store.find, self.describe_reference(key)) or Reference.empty(key.view)
+            lighting, seconds = settings.lighting_of(key.view), settings.reference_seconds * share
+            wanted = Wanted(key, lighting, kept, seconds, settings.reference_spp)
+            self.references[key] = kept
+            if not wanted.complete:
+                groups.setdefault((key.scene, key.tiling, key.surface), []).append(wanted)
+        return [self.reference_job(*case, wanted) for case, wanted in groups.items()]
+
+    def reference_job(self, scene, tiling, surface, wanted):
+        """The job of one group."""
+        text, _ = self.texts.of(self.settings.scene(scene), SURFACES[surface], tiling)
+        return ReferenceJob(f"{scene} x{tiling:g}: reference ({surface})", text, tuple(wanted))
+
+    def describe_reference(self, key: ReferenceKey):
+        """What the store knows a reference by."""
+        _, digest = self.texts.of(self.settings.scene(key.scene), SURFACES[key.surface], key.tiling)
+        return self.store.describe(key, self.settings.lighting_of(key.view), digest)
+
+    # ---- runs --------------------------------------------------------------------------------------------------------
+
+    def render_jobs(self):
+        """A job for each scene, tiling and method that lacks runs; finished runs come from the cache."""
+        groups = {}
+        for run in self.plan.runs:
+            kept = self.recover(self.cache.find, self.describe(run))
+            if kept is None:
+                groups.setdefault((run.scene, run.tiling, run.method), []).append(run)
+            else:
+                self.list_run(run, kept)
+        return [self.render_job(*case, runs) for case, runs in groups.items()]
+
+    def render_job(self, scene, tiling, method, runs):
+        """The job of one group."""
+        text, _ = self.texts.of(self.settings.scene(scene), self.settings.method(method), tiling)
+        return RenderJob(f"{scene} x{tiling:g}: {method}", text, tuple(runs), self.image_seconds)
+
+    def describe(self, run):
+        """What the cache knows a run by."""
+        scene, method = self.settings.scene(run.scene), self.settings.method(run.method)
+        return description(run, self.texts.of(scene, method, run.tiling)[1], self.executor.machine)
+
+    def list_run(self, run, kept):
+        """Put a kept run's image into the output folder, and its record on the list."""
+        image = Path("runs") / run.file_name
+        duplicate(self.cache.path(kept["run"]), self.settings.out / image)
+        method = self.settings.method(run.method)
+        self.provenances[kept["provenance_digest"]] = kept["provenance"]
+        self.records[run] = {
+            **run.record(),
+            "spp": kept["spp"],
+            "label": method.label,
+            "model": method.model,
+            "surface": method.surface,
+            "nonfinite": kept["nonfinite"],
+            "seconds": kept["seconds"],
+            "cpu_seconds": kept["cpu_seconds"],
+            "us_per_sample": 1e6 * kept["seconds"] / (run.view.pixels * kept["spp"]),
+            "load_seconds": kept["load_seconds"],
+            **{key: kept["structure"].get(key) for key in ("structure_bytes", "build_seconds", "bins")},
+            "image": image.as_posix(),
+            "image_digest": kept["image_digest"],
+            "scene_digest": kept["run"]["scene_digest"],
+            "date": kept["date"],
+            "provenance": kept["provenance_digest"],
+        }
+
+    # ---- what is written ---------------------------------------------------------------------------------------------
 
     def write_records(self):
-        """Write results.json as far as it has come."""
-        write_json(self.settings.out / "results.json", self.records)
+        """Write results.json and results.csv as far as they have come, the errors still missing."""
+        records = list(self.records.values())
+        write_json(self.settings.out / "results.json", {"records": records, "provenances": self.provenances})
+        write_csv(self.settings.out / "results.csv", records)
 
-
-class MethodRuns:
-    """All runs of one method on one scene at one tiling: the scene is loaded once."""
-
-    def __init__(self, comparison, scene, tiling, method, views, seconds):
-        """`seconds` is the time that loading and all runs together may take; half of it belongs to the crops."""
-        self.seconds = seconds
-        self.end = time.perf_counter() + seconds
-        self.comparison = comparison
-        self.settings = comparison.settings
-        self.scene, self.tiling, self.method = scene, tiling, method
-        self.frame = views["frame"]
-        self.crops = [view for view in views.values() if not is_frame(view)]
-        self.loaded = LoadedScene(scene.text(method, tiling))
-        self.sample_seconds = self.pilots()
-
-    def run(self):
-        """The frame, then the crops: one seed after the other, from few to many samples, then the time budgets."""
-        self.once(self.frame, self.settings.frame_spp, FIRST_SEED)
-        self.end = max(self.end, time.perf_counter() + self.seconds / 2)
-        seeds = range(FIRST_SEED, FIRST_SEED + self.settings.seeds)
-        for seed in seeds:
-            for spp in self.settings.spps:
-                for crop in self.crops:
-                    self.once(crop, spp, seed)
-        for budget in self.settings.times:
-            for crop in self.crops:
-                spp = self.fitting_spp(crop, budget)
-                for seed in seeds:
-                    self.once(crop, spp, seed, budget)
-
-    def pilots(self):
-        """Wall-clock seconds per sample by view, from short renderings that also warm everything up."""
-        settings = self.settings
-        found = {crop.name: self.pilot(crop, settings.lighting, 1) for crop in self.crops}
-        part = self.scene.views(settings.frame_size, settings.frame_size)[self.crops[0].name]
-        found[self.frame.name] = self.pilot(part, settings.lighting_of(self.frame), settings.frame_spp)
-        return found
-
-    def pilot(self, view, lighting, spp):
-        """Wall-clock seconds per sample at a sample count."""
-        return self.loaded.render(view, lighting, spp, seed=0).seconds / (view.pixels * spp)
-
-    def fitting_spp(self, view, budget):
-        """Samples per pixel that fill `budget` seconds. The cost of a sample depends on their number, so try once."""
-        spp = self.samples_in(view, budget / 4)
-        seconds = self.loaded.render(view, self.settings.lighting_of(view), spp, seed=0).seconds
-        self.sample_seconds[view.name] = seconds / (spp * view.pixels)
-        return self.samples_in(view, budget)
-
-    def samples_in(self, view, seconds):
-        """Samples per pixel in some seconds at the last known speed; at least one."""
-        return max(1, int(seconds / (self.sample_seconds[view.name] * view.pixels)))
-
-    def once(self, view, spp, seed, budget=None):
-        """Carry out one run if there is time for it. Equal-time runs always take place."""
-        samples = view.pixels * spp
-        predicted = self.sample_seconds[view.name] * samples
-        if budget is not None or self.affordable(view, predicted):
-            lighting = self.settings.lighting_of(view)
-            run = Run(self.scene.name, self.tiling, self.method.name, view, lighting, spp, seed, budget)
-            rendering = self.loaded.render(view, lighting, spp, seed)
-            self.sample_seconds[view.name] = rendering.seconds / samples
-            self.keep(run, rendering)
-        elif seed == FIRST_SEED:
-            self.leave_out(view, spp, predicted)
-        self.comparison.progress.advance(budget or samples * GUESSED_SAMPLE_SECONDS)
-
-    def affordable(self, view, predicted):
-        """Whether a run of `predicted` seconds fits the time that is left; a frame has to fit the whole limit."""
-        if is_frame(view) and self.settings.limit is not None:
-            return predicted < LARGEST_FRAME_SHARE * self.settings.limit
-        return predicted < self.end - time.perf_counter()
-
-    def keep(self, run, rendering):
-        """Write a run's image and keep its record."""
-        image = Path("runs") / run.file_name
-        with replacing(self.settings.out / image) as temporary:
-            mi.Bitmap(rendering.image).write(str(temporary))
-        reference = self.comparison.references[run.scene, run.tiling, run.view.name]
-        self.comparison.records.append(
+    def write(self, results):
+        """Write results.json and results.csv."""
+        write_csv(self.settings.out / "results.csv", results.records)
+        write_json(
+            self.settings.out / "results.json",
             {
-                **run.record(),
-                "label": self.method.label,
-                "model": self.method.model,
-                "seconds": rendering.seconds,
-                "cpu_seconds": rendering.cpu_seconds,
-                "us_per_sample": 1e6 * rendering.seconds / (run.view.pixels * run.spp),
-                **metrics.errors(rendering.image, reference),
-                "reference_spp": reference.spp,
-                "image": image,
-                "load_seconds": self.loaded.load_seconds,
-                **{key: self.loaded.structure.get(key) for key in ("structure_bytes", "build_seconds", "bins")},
-            }
+                "records": results.records,
+                "provenances": self.provenances,
+                "summaries": [listed(summary) for summary in results.summaries],
+                "sweep": [listed(summary) for summary in results.sweep],
+                "temporal": [asdict(item) for item in results.temporal],
+                "references": [self.listed_reference(*item) for item in self.references.items()],
+                "left_out": results.left_out,
+                "warnings": results.warnings,
+                "provenance": results.provenance,
+                "seconds": results.seconds,
+            },
         )
 
-    def leave_out(self, view, spp, predicted):
-        """Note a run that would take too long."""
-        self.comparison.left_out.append(
-            {
-                "scene": self.scene.name,
-                "tiling": self.tiling,
-                "method": self.method.name,
-                "view": view.name,
-                "spp": spp,
-                "predicted_seconds": predicted,
-            }
-        )
+    @staticmethod
+    def listed_reference(key, reference):
+        """A reference's line in results.json."""
+        noise = {f"noise_{name}": value for name, value in reference.noise.items()}
+        return {
+            **asdict(key),
+            "spp": reference.spp,
+            "batches": reference.batches,
+            "seconds": reference.seconds,
+            **noise,
+        }
+
+
+def listed(summary):
+    """A summary's line in results.json: the runs by their seeds."""
+    return {**asdict(summary), "runs": [run["seed"] for run in summary.runs]}

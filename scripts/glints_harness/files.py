@@ -1,13 +1,22 @@
 """Files that are either complete or absent, and digests of what a result depends on."""
 
+import csv
 import hashlib
 import json
 import math
 import os
+import shutil
 import tempfile
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+
+class Damaged(Exception):
+    """A kept result whose files are broken or don't fit together; the message names the file."""
 
 
 @contextmanager
@@ -36,9 +45,35 @@ def write_text(path, text):
         temporary.write_text(text, encoding="utf-8")
 
 
+def duplicate(source, target):
+    """Make `target` the same file as `source`, whole or not at all: a hard link where one file system holds both."""
+    with replacing(target) as temporary:
+        temporary.unlink()
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)
+
+
 def write_json(path, value):
     """Write `value` as standard JSON, whole or not at all; see `json_ready` for numbers that JSON lacks."""
     write_text(path, json.dumps(json_ready(value), indent=1, allow_nan=False) + "\n")
+
+
+def write_exr(path, image):
+    """Write a linear image (height, width, 3) as 32-bit floats, whole or not at all."""
+    with replacing(path) as temporary:
+        mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)).write(str(temporary))
+
+
+def write_csv(path, rows):
+    """Write dictionaries as a table with a heading, whole or not at all; lists with spaces, None as nothing."""
+    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
+        table.writeheader()
+        for row in rows:
+            flat = {key: " ".join(map(str, item)) if isinstance(item, list) else item for key, item in row.items()}
+            table.writerow(flat)
 
 
 def json_ready(value):

@@ -1,13 +1,24 @@
 """Methods: a name and what it puts into a scene's glint slot. A new method is one more row of `METHODS`."""
 
+from __future__ import annotations
+
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Callable
 from xml.etree import ElementTree as xml
 
+import mitsuba as mi
+
+from . import maps
+
 GLINTS = "glints"
-"""Reflectance model of this project's plugins (Eq. 4 and 5 of the 2021 paper). The reference has it, too."""
+"""Reflectance model of this project's plugins (Eq. 4 and 5 of the 2021 paper). The references have it, too."""
+
+ROUGH_ALPHA = 0.05
+"""Flake roughness of the column "Ours (rough)" in Figure 7 of the 2021 paper."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +34,24 @@ class Slot:
     conductor: xml.Element
     """The nested `<bsdf type="roughconductor">`."""
 
+    @property
+    def alpha(self):
+        """Beckmann roughness of a flake."""
+        found = self.conductor.find("float[@name='alpha']")
+        if found is None:
+            raise ValueError('the glint slot\'s roughconductor has no alpha; give it <float name="alpha" .../>')
+        return float(found.get("value"))
+
+
+@dataclass(frozen=True)
+class Formula:
+    """What a data structure's memory should be."""
+
+    text: str
+    """For people: N texels, b bins a side."""
+    structure_bytes: Callable[[int, int], float]
+    """Bytes, from the number of texels and of bins a side."""
+
 
 @dataclass(frozen=True)
 class Method:
@@ -36,6 +65,11 @@ class Method:
     parameters: Mapping[str, object] = field(default_factory=dict)
     plugins: tuple = ()
     """Plugins of this project that it needs."""
+    surface: str = "texels"
+    """What it approximates, a key of `SURFACES`: its errors are taken against that surface's reference."""
+    filters: bool = False
+    """Whether it looks at the footprint; if not, the footprint rule means nothing to it."""
+    memory: Formula | None = None
     note: str = ""
 
     def element(self, slot):
@@ -54,8 +88,17 @@ def keep(slot, _parameters):
 
 
 def without_map(slot, _parameters):
-    """The nested `roughconductor` alone."""
-    return copy.deepcopy(slot.conductor)
+    """The nested `roughconductor`, widened by the map's slopes: alpha_u^2 = alpha^2 + 2 var(slope_u), and so for v.
+
+    A Beckmann surface of roughness alpha has slopes of variance alpha^2 / 2, and variances add. The covariance of the
+    two slopes has no place in `roughconductor`, nor has their mean.
+    """
+    element = copy.deepcopy(slot.conductor)
+    alpha = slot.alpha
+    element.remove(element.find("float[@name='alpha']"))
+    for axis, variance in zip("uv", maps.slope_variances(slot.filename)):
+        add_property(element, f"alpha_{axis}", math.sqrt(alpha**2 + 2 * variance))
+    return element
 
 
 def plugin(kind):
@@ -94,12 +137,56 @@ def add_property(element, name, value):
     xml.SubElement(element, tags[type(value)], name=name, value=text)
 
 
+def glints(name, label, kind, memory, parameters=None, **more):
+    """A method that is one of this project's BSDFs, `kind`."""
+    return Method(name, label, GLINTS, plugin(kind), parameters or {}, (kind,), memory=memory, **more)
+
+
+BIN_MAP_MEMORY = Formula(
+    "8 N + 4.2 b² + 0.6 N: two maps of 4 bytes a texel, the index, and a forest of 3 bytes a leaf of about 5 texels",
+    lambda texels, bins: 8.6 * texels + 4.2 * bins**2,
+)
+NORMALS_MEMORY = Formula("12 N: one normal a texel", lambda texels, _bins: 12 * texels)
+FLAT_MEMORY = Formula("14 N: one element a texel, with its tree", lambda texels, _bins: 14 * texels)
+CURVED_MEMORY = Formula(
+    "30 r² N: r² elements a texel, with their tree; the number is that of smooth maps (r = 1), others get r = 2",
+    lambda texels, _bins: 30 * texels,
+)
+
 METHODS = {
     method.name: method
     for method in (
-        Method("glints_ibm", "Inverse bin map", GLINTS, plugin("glints_ibm"), plugins=("glints_ibm",)),
-        Method("glints_direct", "Direct sum", GLINTS, plugin("glints_direct"), plugins=("glints_direct",)),
-        Method("glints_unfiltered", "Unfiltered", GLINTS, plugin("glints_unfiltered"), plugins=("glints_unfiltered",)),
+        glints("glints_ibm", "Inverse bin map", "glints_ibm", BIN_MAP_MEMORY, filters=True),
+        glints(
+            "glints_ibm_rough",
+            "Inverse bin map (rough)",
+            "glints_ibm",
+            BIN_MAP_MEMORY,
+            {"alpha": ROUGH_ALPHA},
+            surface="rough",
+            filters=True,
+            note=f"Rough: flakes of roughness {ROUGH_ALPHA}, measured against a surface of such flakes.",
+        ),
+        glints(
+            "glints_yan16_flat",
+            "Yan et al. 2016, flat elements",
+            "glints_yan16",
+            FLAT_MEMORY,
+            {"elements": "flat"},
+            filters=True,
+        ),
+        glints(
+            "glints_yan16_curved",
+            "Yan et al. 2016, curved elements",
+            "glints_yan16",
+            CURVED_MEMORY,
+            {"elements": "curved"},
+            surface="interpolated",
+            filters=True,
+            note="Curved elements interpolate the map, and are measured against the interpolated surface.",
+        ),
+        glints("glints_direct", "Direct sum", "glints_direct", NORMALS_MEMORY, filters=True),
+        glints("glints_unfiltered", "Unfiltered", "glints_unfiltered", NORMALS_MEMORY),
         Method(
             "normalmap",
             "Stock normalmap",
@@ -113,13 +200,31 @@ METHODS = {
             "Plain roughconductor",
             "smooth surface",
             without_map,
-            note="Plain roughconductor ignores the map: it is here for its time, and its error says what the map adds.",
+            note="Plain roughconductor has the roughness that the map's slopes give on the average (their variances, "
+            "without their covariance): what remains when the map is thrown away.",
         ),
     )
 }
 
-REFERENCE = METHODS["glints_unfiltered"]
-"""The method of the reference: no footprint, no data structure, only many samples."""
+SURFACES = {
+    "texels": METHODS["glints_unfiltered"],
+    "rough": glints(
+        "surface_rough", "Unfiltered (rough)", "glints_unfiltered", NORMALS_MEMORY, {"alpha": ROUGH_ALPHA}
+    ),
+    "interpolated": glints(
+        "surface_interpolated",
+        "Unfiltered (interpolated)",
+        "glints_unfiltered",
+        NORMALS_MEMORY,
+        {"interpolation": "bilinear"},
+    ),
+}
+"""The surfaces that methods approximate, as methods without footprint or data structure: those of the references.
+
+`texels`: every texel a flat mirror patch, as in the 2021 paper; `rough`: the same with rough flakes; `interpolated`: the
+map interpolated bilinearly. To measure a method against a surface that it does not have would count as an error what
+it does on purpose.
+"""
 
 
 def choose(names):
@@ -128,3 +233,13 @@ def choose(names):
     if unknown:
         raise ValueError(f"unknown method {', '.join(unknown)}; there are {', '.join(METHODS)}")
     return [METHODS[name] for name in dict.fromkeys(names)]
+
+
+def check_plugins(methods):
+    """Refuse methods whose plugins are not installed."""
+    for name in dict.fromkeys(name for method in methods for name in method.plugins):
+        if not any((Path(str(folder)) / "plugins" / f"{name}.so").is_file() for folder in mi.file_resolver()):
+            users = ", ".join(method.name for method in methods if name in method.plugins)
+            raise ValueError(
+                f"the plugin {name} is not installed; run scripts/setup, or leave out {users} (--methods)"
+            )

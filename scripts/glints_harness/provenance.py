@@ -9,14 +9,16 @@ from pathlib import Path
 
 from .files import digest_files
 
-PACKAGES = ("mitsuba", "drjit", "mitsuba-glints", "numpy", "scipy", "matplotlib")
+PACKAGES = ("mitsuba", "drjit", "mitsuba-glints", "numpy", "scipy", "flip-evaluator", "matplotlib", "distributed")
 
 
+@cache
 def versions():
     """Installed versions of what decides a result, name to version; None for a package that is not there."""
     return {**{name: version(name) for name in PACKAGES}, "python": platform.python_version()}
 
 
+@cache
 def version(package):
     """The installed version of a package, or None."""
     try:
@@ -34,6 +36,7 @@ def plugin_digest():
     return digest_files(Path(found.origin).parent.rglob("*.so"))
 
 
+@cache
 def machine():
     """Processor, cores, memory and system of this machine."""
     return {
@@ -59,6 +62,11 @@ def now():
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
 
 
+def environment():
+    """What decides a result beside its parameters: versions, plugins, machine."""
+    return {"versions": versions(), "plugins": plugin_digest(), "machine": machine()}
+
+
 def provenance():
-    """Everything above."""
-    return {"date": now(), "versions": versions(), "plugins": plugin_digest(), "machine": machine()}
+    """The environment, and the date."""
+    return {"date": now(), **environment()}

@@ -7,17 +7,16 @@ when more samples are asked for.
 """
 
 import json
+import zipfile
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from . import provenance
-from .files import digest_text, replacing, write_json
-from .render import LoadedScene
-from .scenes import scene_digest
+from .files import Damaged, digest_text, replacing, write_json
 
-BATCH_SAMPLES = 200_000
-"""Samples of one batch over the whole view: a fraction of a second."""
+BATCH_SAMPLES = 50_000
+"""Samples of one batch over the whole view: a tenth of a second."""
 
 FIRST_SEED = 100_000
 """Seeds of the batches count up from here, far from those of measured runs, so that their noise is independent."""
@@ -38,6 +37,8 @@ class Reference:
     batches: int = 0
     seconds: float = 0.0
     provenance: dict = field(default_factory=dict)
+    noise: dict = field(default_factory=dict)
+    """`metrics.noise_of` this reference, once measured."""
 
     @classmethod
     def empty(cls, view):
@@ -48,6 +49,11 @@ class Reference:
     @property
     def spp(self):
         return self.batches * self.batch_spp
+
+    @property
+    def next_seed(self):
+        """Of the batch to come."""
+        return FIRST_SEED + self.batches
 
     @property
     def standard_error(self):
@@ -77,61 +83,53 @@ def batch_spp(view):
 class ReferenceStore:
     """A folder of references, one pair of files (data, provenance for people to read) each."""
 
-    def __init__(self, folder, method):
-        """`method` is what references are rendered with."""
+    def __init__(self, folder):
         self.folder = folder
-        self.method = method
 
-    def obtain(self, scene, tiling, view, lighting, seconds, spp=None, tick=lambda: None):
-        """The reference of a view of a scene, read, refined or rendered.
+    def describe(self, key, lighting, digest):
+        """Everything a reference depends on; its digest names the file.
 
-        `seconds` of rendering, or `spp` samples per pixel if given, are the least it is to have. `tick` is called after
-        every batch. What was rendered before an interruption is kept.
+        `key` is a `plan.ReferenceKey`, `digest` that of the resolved scene.
         """
-        text = scene.text(self.method, tiling)
-        described = self.describe(scene, text, tiling, view, lighting)
-        path = self.folder / f"{scene.name}-x{tiling:g}-{view.name}-{digest_text(json.dumps(described))[:16]}.npz"
-        reference = read(path, described) or Reference.empty(view)
-        if reference.enough(seconds, spp):
-            return reference
-        loaded = LoadedScene(text)
-        try:
-            while not reference.enough(seconds, spp):
-                reference.add(loaded.render(view, lighting, reference.batch_spp, FIRST_SEED + reference.batches))
-                tick()
-        finally:
-            if reference.batches:
-                reference.provenance = {**described, **self.history(reference)}
-                write(path, reference)
-        return reference
-
-    def describe(self, scene, text, tiling, view, lighting):
-        """Everything a reference depends on; its digest names the file."""
-        return {
-            "scene": scene.name,
-            "tiling": tiling,
-            "scene_digest": scene_digest(text),
-            "method": self.method.name,
-            "view": asdict(view),
+        described = {
+            **asdict(key),
+            "scene_digest": digest,
             "integrator": lighting.integrator,
             "max_depth": lighting.max_depth,
-            "batch_spp": batch_spp(view),
+            "batch_spp": batch_spp(key.view),
             "first_seed": FIRST_SEED,
             "mitsuba": provenance.version("mitsuba"),
             "plugins": provenance.plugin_digest(),
         }
+        return json.loads(json.dumps(described))
 
-    @staticmethod
-    def history(reference):
-        """How the reference came about."""
-        return {
-            "batches": reference.batches,
-            "spp": reference.spp,
-            "seeds": [FIRST_SEED, FIRST_SEED + reference.batches - 1],
-            "seconds": reference.seconds,
-            "date": provenance.now(),
-            "machine": provenance.machine(),
-        }
+    def path(self, described):
+        """Where a reference's data lie."""
+        view, digest = described["view"], digest_text(json.dumps(described))[:16]
+        frame = "" if view["frame"] is None else f"frame{view['frame']:03d}-"
+        name = f"{described['scene']}-x{described['tiling']:g}-{view['name']}-{frame}{described['surface']}-{digest}"
+        return self.folder / f"{name}.npz"
+
+    def find(self, described):
+        """The reference as far as it has come, or None."""
+        return read(self.path(described), described)
+
+    def keep(self, described, reference):
+        """Write a reference as far as it has come."""
+        reference.provenance = {**described, **history(reference)}
+        write(self.path(described), reference)
+
+
+def history(reference):
+    """How a reference came about."""
+    return {
+        "batches": reference.batches,
+        "spp": reference.spp,
+        "seeds": [FIRST_SEED, FIRST_SEED + reference.batches - 1],
+        "seconds": reference.seconds,
+        "date": provenance.now(),
+        "machine": provenance.machine(),
+    }
 
 
 def write(path, reference):
@@ -149,13 +147,22 @@ def write(path, reference):
 
 
 def read(path, described):
-    """Read a reference, or None if there is none with just this description."""
+    """Read a reference, or None if there is none; raises `Damaged` if the file is not this reference."""
     if not path.is_file():
         return None
-    with np.load(path) as data:
-        kept = json.loads(str(data["provenance"]))
-        if any(kept.get(key) != value for key, value in json.loads(json.dumps(described)).items()):
-            return None
-        return Reference(
-            described["batch_spp"], data["mean"], data["squares"], int(data["batches"]), float(data["seconds"]), kept
-        )
+    try:
+        with np.load(path) as data:
+            kept = json.loads(str(data["provenance"]))
+            found = Reference(
+                described["batch_spp"],
+                data["mean"],
+                data["squares"],
+                int(data["batches"]),
+                float(data["seconds"]),
+                kept,
+            )
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise Damaged(f"{path}: {error}") from error
+    if any(kept.get(key) != value for key, value in described.items()):
+        raise Damaged(f"{path}: it is another reference's")
+    return found

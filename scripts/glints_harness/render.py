@@ -1,8 +1,10 @@
 """Carries out runs in Mitsuba: one loaded scene per method, any number of views, sample counts and seeds."""
 
+from __future__ import annotations
+
 import re
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -14,20 +16,21 @@ VARIANT = "scalar_rgb"
 
 @dataclass(frozen=True)
 class Lighting:
-    """The integrator and its settings, the same for all methods of a comparison."""
+    """The integrator and its settings."""
 
     integrator: str = "glints_path"
     max_depth: int = 2
     """Longest path in segments, as in Mitsuba: 2 is direct light."""
     footprint: str = "sample"
-    """`sample`: ray differentials shrink with the square root of the sample count; `pixel`; or a number of pixels."""
+    """`sample`: ray differentials shrink with the square root of the sample count; `pixel`; a number of pixels; or
+    `none` where the method doesn't look at it."""
 
     def load(self):
         """The Mitsuba integrator. Only `glints_path` knows the footprint rule, and only `direct` knows no depth."""
         described = {"type": self.integrator}
         if self.integrator != "direct":
             described["max_depth"] = self.max_depth
-        if self.integrator == "glints_path":
+        if self.integrator == "glints_path" and self.footprint != "none":
             described["footprint"] = self.footprint
         return mi.load_dict(described)
 
@@ -37,38 +40,43 @@ class Run:
     """One rendering: everything that tells it from another."""
 
     scene: str
-    tiling: int
+    tiling: float
     method: str
     view: View
     lighting: Lighting
-    spp: int
+    spp: int | None
+    """Samples per pixel; None where a time budget decides."""
     seed: int
-    time_budget: float = None
-    """Seconds that `spp` was chosen to fill, in an equal-time comparison."""
+    time_budget: float | None = None
+    """Seconds that the rendering is to fill, in an equal-time comparison."""
+    budget_includes_build: bool = False
+    """Whether building the data structure is paid from the time budget."""
+
+    @property
+    def point(self):
+        """What runs that are taken together share: all but the seed and, in a sequence, the frame."""
+        view = self.view if self.view.frame is None else replace(self.view, frame=0, turn=0.0)
+        return replace(self, seed=0, view=view)
 
     def record(self):
         """The run's parameters, flat, as they stand in results.json."""
-        record = {
-            "scene": self.scene,
-            "tiling": self.tiling,
-            "method": self.method,
-            "view": self.view.name,
-            "crop": list(self.view.crop),
-            "width": self.view.width,
-            "height": self.view.height,
-            "spp": self.spp,
-            "seed": self.seed,
-            "time_budget": self.time_budget,
-        }
-        return {**record, **asdict(self.lighting)}
+        view = asdict(self.view)
+        record = {key: value for key, value in asdict(self).items() if key not in ("view", "lighting")}
+        return {**record, **asdict(self.lighting), **view, "view": view.pop("name"), "crop": list(self.view.crop)}
 
     @property
     def file_name(self):
         """The name of the run's image, which is as unique as the run among those of one comparison."""
-        budget = "" if self.time_budget is None else f"-{self.time_budget:g}s"
-        return (
-            f"{self.scene}-x{self.tiling:g}/{self.view.name}/{self.method}-{self.spp}spp{budget}-seed{self.seed}.exr"
-        )
+        return self.file_of(f"seed{self.seed}")
+
+    def file_of(self, which):
+        """The name of an image of this run's point: of a seed, or of the mean over them."""
+        amount = f"{self.spp}spp"
+        if self.time_budget is not None:
+            amount = f"{self.time_budget:g}s" + ("-with-build" if self.budget_includes_build else "")
+        method = self.method if self.lighting.footprint == "none" else f"{self.method}-{self.lighting.footprint}"
+        frame = "" if self.view.frame is None else f"-frame{self.view.frame:03d}"
+        return f"{self.scene}-x{self.tiling:g}/{self.view.folder}/{method}-{amount}{frame}-{which}.exr"
 
 
 @dataclass(frozen=True)
@@ -92,22 +100,54 @@ class LoadedScene:
         self.scene = mi.load_string(text)
         self.load_seconds = time.perf_counter() - start
         self.structure = structure(self.scene)
+        to_world = mi.traverse(self.scene.sensors()[0])["to_world"]
+        self.to_world = type(to_world)(to_world)
+        self.pivots = {}
 
     def render(self, view, lighting, spp, seed):
         """Render a `View`; returns a `Rendering`."""
-        self._point_at(view)
+        self.point_at(view)
         integrator = lighting.load()
         wall, processor = time.perf_counter(), time.process_time()
         image = np.array(mi.render(self.scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)
         return Rendering(image[..., :3], time.perf_counter() - wall, time.process_time() - processor)
 
-    def _point_at(self, view):
-        """Set the film to a view. The footprint of a crop stays that of its full frame."""
-        film = mi.traverse(self.scene.sensors()[0])
-        film["film.size"] = [view.width, view.height]
-        film["film.crop_offset"] = list(view.crop[:2])
-        film["film.crop_size"] = list(view.crop[2:])
-        film.update()
+    def point_at(self, view):
+        """Set the sensor to a view. The footprint of a crop stays that of its full frame."""
+        self._set_sensor(view, self.to_world)
+        if view.turn:
+            self._set_sensor(view, self._turned(view))
+
+    def _set_sensor(self, view, to_world):
+        """Set film, crop and place of the camera."""
+        # Mitsuba takes the crop of a film whose size changes to be the whole film unless the crop changes, too: so
+        # first the whole film, then the crop.
+        whole = (0, 0, view.width, view.height)
+        for crop in (whole, view.crop):
+            sensor = mi.traverse(self.scene.sensors()[0])
+            sensor["film.size"] = [view.width, view.height]
+            sensor["film.crop_offset"] = list(crop[:2])
+            sensor["film.crop_size"] = list(crop[2:])
+            sensor["to_world"] = to_world
+            sensor.update()
+
+    def _turned(self, view):
+        """The camera's place, turned by `view.turn` degrees about the surface point in the middle of the view."""
+        pivot = self._pivot(view)
+        turn = type(self.to_world)
+        axis = self.to_world @ mi.ScalarVector3f(0, 1, 0)
+        return turn().translate(pivot) @ turn().rotate(axis, view.turn) @ turn().translate(-pivot) @ self.to_world
+
+    def _pivot(self, view):
+        """The surface point that the unturned camera sees in the middle of a view."""
+        key = (view.width, view.height, view.crop)
+        if key not in self.pivots:
+            ray, _ = self.scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+            hit = self.scene.ray_intersect(ray)
+            if not hit.is_valid():
+                raise ValueError(f"the middle of {view.name} shows no surface for the camera to turn about")
+            self.pivots[key] = mi.ScalarVector3f(hit.p)
+        return self.pivots[key]
 
     def glinting_pixels(self, identity, view, side=128):
         """Footprints of the pixels of a view that show the BSDF `identity`, on a grid of `side` by `side` pixels.
@@ -115,7 +155,7 @@ class LoadedScene:
         Returns an array of their widths in uv (square roots of the areas), one for each such pixel of the grid: its
         length by the square of `side` is the share of the view that glints.
         """
-        self._point_at(view)
+        self.point_at(view)
         sensor = self.scene.sensors()[0]
         widths = []
         for index in range(side * side):
@@ -130,13 +170,18 @@ class LoadedScene:
 
 
 def structure(scene):
-    """`structure_bytes`, `build_seconds`, `bins` as the scene's glint BSDFs print them; absent if none does."""
+    """`structure_bytes`, `build_seconds`, `bins` as the scene's glint BSDFs print them; absent if none has it.
+
+    A method without bins prints 0 of them.
+    """
     text = "\n".join(str(shape.bsdf()) for shape in scene.shapes())
     found = {}
     for name, kind in (("structure_bytes", int), ("build_seconds", float), ("bins", int)):
         match = re.search(rf"\b{name}\s*[=:]\s*([0-9.eE+-]+)", text)
         if match:
             found[name] = kind(float(match.group(1)))
+    if found.get("bins") == 0:
+        del found["bins"]
     return found
 
 
@@ -165,10 +210,16 @@ def collect_warnings():
 
 def start():
     """Choose the variant and make this project's plugins known, if they are installed; returns the warnings' counter."""
-    mi.set_variant(VARIANT)
+    prepare_thread()
+    return collect_warnings()
+
+
+def prepare_thread():
+    """Choose the variant in this thread, which may be one of a pool, and make this project's plugins known."""
+    if mi.variant() != VARIANT:
+        mi.set_variant(VARIANT)
     try:
         import mitsuba_glints  # noqa: F401
     except ModuleNotFoundError as error:
         if error.name != "mitsuba_glints":
             raise
-    return collect_warnings()

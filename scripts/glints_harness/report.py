@@ -1,244 +1,253 @@
-"""The report: one HTML file with Figure 7 of the 2021 paper for these scenes, the plots, the tables and provenance."""
+"""The report: one HTML file with Figure 7 and Tables 2 to 4 of the 2021 paper for these scenes, a viewer of all
+pictures, all errors, costs and provenance. It needs no network and no other file."""
 
-from dataclasses import dataclass
+import json
 from pathlib import Path
 
 import jinja2
+import matplotlib
 import numpy as np
+from markupsafe import Markup
 
-from . import images, metrics, paper, plots
-from .files import write_text
-from .methods import METHODS
-from .summary import common_spp, select, summarise
+from . import animation, images, metrics, paper, plots, report_pictures, report_plots, report_tables, report_workers
+from .files import json_ready, write_text
+from .report_plots import AXES, METRIC_TITLES
+from .report_text import case_id, case_title, long_label, number, short_label
+from .summary import select
 
-CROP_COLOURS = ("#ff5a36", "#ffd23f", "#3ddc97", "#4dabf7")
-"""Outlines of the crops in the frame and of their enlargements."""
+TEMPLATES = Path(__file__).parent / "templates"
 
-PLOTS = (("rmse", "spp"), ("rmse", "seconds"), ("relmse", "spp"), ("relmse", "seconds"))
+SCRIPTS = ("report_data.js", "report_colour.js", "report_viewer.js", "report_page.js")
+"""In the order in which they use each other."""
 
+COLOUR_TABLES = {"inferno": "inferno", "magma": "magma", "signed": "RdBu_r"}
+"""The page's names of matplotlib's colour tables."""
 
-@dataclass(frozen=True)
-class Context:
-    """What a report is made of."""
-
-    settings: object
-    records: list
-    references: dict
-    """(scene, tiling, view name) to `Reference`."""
-    left_out: list
-    provenance: dict
-    warnings: dict
-    exposure: float
-    seconds: float
-
-    @property
-    def out(self):
-        return self.settings.out
+SCHEME = {
+    plots.INK: "currentColor",
+    plots.LINE: "var(--line)",
+    plots.FAINT: "var(--faint)",
+    plots.NOISE: "var(--noise)",
+}
+"""Colours of a plot that follow the page's light or dark scheme."""
 
 
-def write(context):
-    """Write index.html and the pictures and plots in it; returns its path."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+def write(results):
+    """Write index.html, plots/ and animations/ into the results' folder; returns the path of index.html."""
+    chosen = all_plots(results)
+    with report_workers.pool() as pool:
+        drawn = {identity: pool.submit(plots.draw, plot, results.out / "plots") for identity, plot in chosen.items()}
+        gallery = report_pictures.gallery(results, pool)
+        sequences = [sequence(results, *case) for case in temporal_cases(results)]
+        packed = {identity: packed_plot(future.result()) for identity, future in drawn.items()}
+        gallery.finish()
+    page = environment().get_template("report.html.j2")
+    text = page.render(
+        results=results,
+        settings=results.settings,
+        epsilon=metrics.RELMSE_EPSILON,
+        exposures=metrics.FLIP_EXPOSURES,
+        precision=precision(),
+        metrics=METRIC_TITLES,
+        axes=AXES,
+        figure=[
+            figure_row(results, gallery, chosen, scene, tiling)
+            for scene in results.settings.scenes
+            for tiling in results.settings.tilings
+        ],
+        **tables(results),
+        sweep_plots=[identity for identity in chosen if identity.startswith("sweep/")],
+        largest_tiling=max((item.tiling for item in results.sweep), default=1),
+        sequences=sequences,
+        css=Markup((TEMPLATES / "report.css").read_text(encoding="utf-8")),
+        javascript=Markup("\n".join((TEMPLATES / name).read_text(encoding="utf-8") for name in SCRIPTS)),
+        index=script_json({**gallery.index(), **viewer_settings(results)}),
+        data={**gallery.data, **packed},
+    )
+    path = results.out / "index.html"
+    write_text(path, text)
+    return path
+
+
+def precision():
+    """How far a picture's pixels may be off, in percent: half of the last stored bit."""
+    bits = {"crop": report_pictures.CROP_MANTISSA, "frame": report_pictures.FRAME_MANTISSA}
+    return {view: number(100 * 2.0 ** -(mantissa + 1), 2) for view, mantissa in bits.items()}
+
+
+def environment():
+    """The templates."""
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters.update(number=number, signed=signed, bytes=bytes_text, percent=percent)
-    summaries = summarise(context.records)
-    page = environment.get_template("report.html.j2").render(
-        context=context,
-        settings=context.settings,
-        methods=context.settings.methods,
-        epsilon=metrics.RELMSE_EPSILON,
-        sections=[
-            section(context, summaries, scene, tiling)
-            for scene in context.settings.scenes
-            for tiling in context.settings.tilings
-        ],
-        costs=costs(context, summaries),
-        paper=paper,
-        spp=common_spp(summaries),
-    )
-    path = context.out / "index.html"
-    write_text(path, page)
-    return path
 
 
-def section(context, summaries, scene, tiling):
-    """One scene at one tiling: a row of Figure 7."""
-    mine = select(summaries, scene=scene.name, tiling=tiling)
-    views = scene.views(context.settings.size, context.settings.frame_size)
+def script_json(value):
+    """JSON that may stand in a script element."""
+    return Markup(json.dumps(json_ready(value), allow_nan=False).replace("<", "\\u003c"))
+
+
+def viewer_settings(results):
+    """What the viewer's scripts have to know beside the pictures."""
+    return {"exposure": results.exposure, "epsilon": metrics.RELMSE_EPSILON, "colours": colour_tables()}
+
+
+def colour_tables():
+    """Colour tables of 256 entries as hexadecimal text."""
+    steps = np.linspace(0, 1, 256)
     return {
-        "scene": scene,
-        "tiling": tiling,
+        name: (matplotlib.colormaps[source](steps)[:, :3] * 255 + 0.5).astype(np.uint8).tobytes().hex()
+        for name, source in COLOUR_TABLES.items()
+    }
+
+
+# ---- plots -----------------------------------------------------------------------------------------------------------
+
+
+def all_plots(results):
+    """{identifier of the page's script element: `plots.Plot`}."""
+    found = {f"plot/{'/'.join(key)}": plot for key, plot in report_plots.convergence_plots(results).items()}
+    found.update({f"sweep/{'/'.join(key)}": plot for key, plot in report_plots.sweep_plots(results).items()})
+    found.update({f"trace/{case}": plot for case, plot in report_plots.trace_plots(results).items()})
+    return found
+
+
+def packed_plot(drawn):
+    """A plot for the page: scalable, in the page's colours, its hover groups findable among many plots."""
+    svg = drawn["svg"][drawn["svg"].index("<svg") :]
+    head, body = svg.split(">", 1)
+    box = head[head.index("viewBox") :].split('"')[1]
+    for colour, name in SCHEME.items():
+        body = body.replace(f": {colour}", f": {name}")
+    svg = f'<svg viewBox="{box}" role="img">{body}'.replace('id="points-', 'data-points="points-')
+    return images.deflated(json.dumps({"svg": svg, "points": drawn["points"]}).encode("utf-8"))
+
+
+# ---- Figure 7 --------------------------------------------------------------------------------------------------------
+
+
+def figure_row(results, gallery, chosen, scene, tiling):
+    """A row of Figure 7: the frame, and for each crop the enlargements in the paper's order and one of the `chosen` plots."""
+    case = gallery.case(case_id(scene.name, tiling))
+    frame = next((view for view in case["views"] if view["name"] == "frame"), None)
+    crops = [view for view in case["views"] if view is not frame]
+    return {
+        "title": f"{scene.name.capitalize()}, texture tiling ×{tiling:g}",
         "tiles": scene.base_tiles * tiling,
-        "frames": frames(context, mine, scene, tiling),
-        "outlines": [outline(view, colour) for view, colour in crop_views(views)],
-        "crops": [crop(context, mine, scene, tiling, view, colour) for view, colour in crop_views(views)],
-        "rows": [item for item in mine if item.view != "frame"],
-        "frame_rows": select(mine, view="frame"),
-        "left_out": [item for item in context.left_out if (item["scene"], item["tiling"]) == (scene.name, tiling)],
+        "map": scene.normal_map.name,
+        "alpha": number(scene.alpha, 4),
+        "frame": frame_entry(gallery, frame),
+        "outlines": [{**view["box"], "colour": view["colour"]} for view in crops],
+        "crops": [
+            {
+                "title": view["title"].capitalize(),
+                "colour": view["colour"],
+                "place": view["place"],
+                "strips": [strip(gallery, group) for group in view["groups"] if not group["mean"]],
+                "plot": identity if identity in chosen else "",
+            }
+            for view in crops
+            for identity in [f"plot/{case['id']}/{view['name']}/rmse/seconds"]
+        ],
     }
 
 
-def crop_views(views):
-    """The crops with their colours."""
-    crops = [view for view in views.values() if view.name != "frame"]
-    return list(zip(crops, CROP_COLOURS))
-
-
-def outline(view, colour):
-    """Place of a crop in the frame, in percent of the frame."""
-    x, y, width, height = (100 * value / view.width for value in view.crop)
-    return {"x": x, "y": y, "width": width, "height": height, "colour": colour, "name": view.name}
-
-
-def frames(context, summaries, scene, tiling):
-    """Pictures of the frame, one for each method that has one, and the reference."""
-    shown = [
-        {"method": item.method, "title": title(item), "uri": picture(context, context.out / item.image)}
-        for item in select(summaries, view="frame")
-    ]
-    return [*shown, reference_picture(context, scene, tiling, "frame")]
-
-
-def crop(context, summaries, scene, tiling, view, colour):
-    """Enlargements and plots of one crop."""
-    mine = select(summaries, view=view.name)
-    return {
-        "name": view.name,
-        "colour": colour,
-        "place": f"{view.crop[2]} × {view.crop[3]} pixels at ({view.crop[0]}, {view.crop[1]}) of {view.width} × {view.height}",
-        "strips": strips(context, mine),
-        "reference": reference_picture(context, scene, tiling, view.name),
-        "plots": [plot(context, mine, scene, tiling, view, *axes) for axes in PLOTS] if mine else [],
-    }
-
-
-def strips(context, summaries):
-    """Rows of enlargements: few samples, many samples, then each time budget; methods side by side."""
-    spps = sorted({item.spp for item in summaries if item.time_budget is None})
-    groups = [(f"{spp} spp", {"spp": spp, "time_budget": None}) for spp in dict.fromkeys((*spps[:1], *spps[-1:]))]
-    budgets = sorted({item.time_budget for item in summaries if item.time_budget is not None})
-    groups += [(f"{budget:g} s", {"time_budget": budget}) for budget in budgets]
-    return [
-        {
-            "title": heading,
-            "pictures": [strip_picture(context, summaries, method, wanted) for method in context.settings.methods],
-        }
-        for heading, wanted in groups
-    ]
-
-
-def strip_picture(context, summaries, method, wanted):
-    """One method's enlargement, or a gap if the method was left out there."""
-    found = select(summaries, method=method.name, **wanted)
-    if not found:
-        return {"method": method.name, "item": None}
-    item = found[0]
-    return {
-        "method": item.method,
-        "title": title(item),
-        "uri": picture(context, context.out / item.image),
-        "item": item,
-    }
-
-
-def title(item):
-    """A picture's caption for pointing devices and screen readers."""
-    label = METHODS[item.method].label
-    return f"{label}, {item.spp} spp, {item.seconds:.2f} s, RMSE {number(item.rmse)}"
-
-
-def picture(context, exr):
-    """A rendering as PNG beside its EXR, as a URI."""
-    path = exr.with_suffix(".png")
-    images.write_png(path, images.tone_map(images.read_exr(exr), context.exposure))
-    return images.data_uri(path)
-
-
-def reference_picture(context, scene, tiling, view):
-    """The reference as PNG, as a URI."""
-    reference = context.references[scene.name, tiling, view]
-    path = context.out / "runs" / f"{scene.name}-x{tiling:g}" / view / f"reference-{reference.spp}spp.png"
-    images.write_png(path, images.tone_map(reference.mean.astype(np.float32), context.exposure))
-    caption = f"Reference, {reference.spp} spp, {reference.batches} seeds, {reference.seconds:.1f} s"
-    return {"method": "reference", "title": caption, "uri": images.data_uri(path), "spp": reference.spp}
-
-
-def plot(context, summaries, scene, tiling, view, y, x):
-    """A convergence plot as SVG file and URI."""
-    path = context.out / "plots" / f"{scene.name}-x{tiling:g}-{view.name}-{y}-over-{x}.svg"
-    plots.convergence(path, summaries, x, y)
-    return {"uri": images.data_uri(path), "title": f"{y} over {x}, {scene.name} x{tiling:g} {view.name}"}
-
-
-def costs(context, summaries):
-    """Rows of the table of costs: one for each scene, tiling and method."""
-    rows = []
-    for scene in context.settings.scenes:
-        for tiling in context.settings.tilings:
-            for method in context.settings.methods:
-                mine = select(summaries, scene=scene.name, tiling=tiling, method=method.name)
-                if mine:
-                    rows.append(cost(scene, tiling, method, mine, summaries))
-    return rows
-
-
-def cost(scene, tiling, method, mine, summaries):
-    """Build time, memory, time per frame and per sample, and the errors at the sample count that all methods have."""
-    frame = next(iter(select(mine, view="frame")), None)
-    stock = next(iter(select(summaries, scene=scene.name, tiling=tiling, method="normalmap", view="frame")), None)
-    spp = common_spp(summaries)
-    measured = [item for item in mine if item.view != "frame" and item.time_budget is None and item.spp == spp]
-    run = mine[0].runs[0]
-    return {
-        "scene": scene.name,
-        "tiling": tiling,
-        "method": method,
-        "paper": paper_column(scene.name, method.name),
-        "build_seconds": run["build_seconds"],
-        "structure_bytes": run["structure_bytes"],
-        "bins": run["bins"],
-        "frame_seconds": frame and frame.seconds,
-        "frame_spp": frame and frame.spp,
-        "us_per_sample": frame and frame.mean("us_per_sample"),
-        "ratio": frame.mean("cpu_seconds") / stock.mean("cpu_seconds") if frame and stock else None,
-        "rmse": metrics.root_mean_square([item.rmse for item in measured]) if measured else None,
-        "relmse": sum(item.relmse for item in measured) / len(measured) if measured else None,
-        "mean_error": sum(item.mean("mean_error") for item in measured) / len(measured) if measured else None,
-        "mean_reference": sum(item.mean("mean_reference") for item in measured) / len(measured) if measured else None,
-        "at_reference_noise": bool(measured) and all(item.at_reference_noise for item in measured),
-        "nonfinite": sum(item.nonfinite for item in mine),
-    }
-
-
-def paper_column(scene, method):
-    """What the paper's Tables 2 and 3 print for a method on a scene, or None."""
-    if method != "glints_ibm" or scene not in paper.TABLES_2_AND_3:
+def frame_entry(gallery, view):
+    """The frame of the method that the figure is about, or of the first one that has a frame; None without any."""
+    if view is None:
         return None
-    return paper.TABLES_2_AND_3[scene][0]
+    shots = [index for group in view["groups"] for index in group["shots"]]
+    mine = [index for index in shots if gallery.shots[index]["method"] == "glints_ibm"] or shots
+    return {"shot": mine[0], **gallery.shots[mine[0]]} if mine else None
 
 
-def number(value, digits=3):
-    """A number with some significant digits; a dash for none."""
-    return "–" if value is None else f"{value:.{digits}g}"
+def strip(gallery, group):
+    """The paper's four methods and the reference at one sample count."""
+    entries = []
+    for method, name in report_tables.COLUMNS_OF_FIGURE_7.items():
+        mine = [index for index in group["shots"] if gallery.shots[index]["method"] == method]
+        gone = "left out" if any(absent["method"] == method for absent in group["absent"]) else "not compared"
+        entries.append(strip_entry(gallery, name, mine, gone))
+    references = [index for index in group["shots"] if gallery.shots[index]["method"] == "reference"]
+    return [*entries, strip_entry(gallery, "Reference", references, "not compared")]
 
 
-def signed(value, digits=2):
-    """A number with its sign."""
-    return "–" if value is None else f"{value:+.{digits}g}"
+def strip_entry(gallery, name, shots, gone):
+    """One enlargement; without one, `gone` says why."""
+    if not shots:
+        return {"shot": None, "name": name, "label": name, "detail": gone}
+    shot = gallery.shots[shots[0]]
+    error = f"RMSE {shot['errors']['rmse'].split(' ')[0]}" if "rmse" in shot["errors"] else ""
+    if shot["method"] == "reference":
+        error = ""
+    return {"shot": shots[0], "name": name, "label": shot["label"], "detail": shot["detail"], "error": error}
 
 
-def percent(value):
-    """A share in percent with its sign."""
-    return "–" if value is None else f"{100 * value:+.1f} %"
+# ---- tables and sequences --------------------------------------------------------------------------------------------
 
 
-def bytes_text(value):
-    """Bytes in decimal megabytes, as in the paper; a dash for none."""
-    if value is None:
-        return "–"
-    return f"{value / 1e6:.1f} MB" if value >= 1e5 else f"{value} B"
+def tables(results):
+    """All tables of the page by the names that its template has for them."""
+    formulas = {}
+    for method in results.settings.methods:
+        if method.memory is not None:
+            formulas.setdefault(method.memory.text, []).append(method.label)
+    return {
+        "table_2": report_tables.table_2_or_3(results, "structure_bytes", f"{paper.MEMORY_RATIO}×"),
+        "table_3": report_tables.table_2_or_3(results, "build_seconds", f"nearly {paper.BUILD_RATIO}×"),
+        "table_4": report_tables.table_4(results),
+        "error_cases": error_cases(results),
+        "sweep_table": report_tables.sweep_table(results),
+        "temporal_table": report_tables.temporal_table(results),
+        "cost_table": report_tables.cost_table(results),
+        "formulas": formulas,
+        "left_out": report_tables.left_out_table(results),
+    }
+
+
+def error_cases(results):
+    """The error tables of every scene and tiling, and the crops that have plots."""
+    cases = []
+    for scene in results.settings.scenes:
+        for tiling in results.settings.tilings:
+            mine = select(results.summaries, scene=scene.name, tiling=tiling)
+            mine = [item for item in mine if item.frame is None and item.errors]
+            order = list(dict.fromkeys(map(long_label, mine)))
+            mine.sort(key=lambda item: (order.index(long_label(item)), item.view, item.time_budget or 0, item.spp))
+            cases.append(
+                {
+                    "id": case_id(scene.name, tiling),
+                    "title": case_title(scene.name, tiling),
+                    "views": sorted({item.view for item in mine if item.view != "frame"}),
+                    "tables": {metric: report_tables.error_table(mine, metric) for metric in METRIC_TITLES},
+                }
+            )
+    return cases
+
+
+def temporal_cases(results):
+    """Scenes and tilings that have a sequence."""
+    return list(dict.fromkeys((item.scene, item.tiling) for item in results.temporal))
+
+
+def sequence(results, scene, tiling):
+    """The animation of one scene at one tiling."""
+    mine = [item for item in results.temporal if (item.scene, item.tiling) == (scene, tiling)]
+    captions = ["Reference" if item.method == "reference" else short_label(item) for item in mine]
+    paths = [[results.out / image for image in item.images] for item in mine]
+    file = results.out / "animations" / f"{case_id(scene, tiling)}.webp"
+    made = animation.write(file, list(zip(captions, paths)), results.exposure)
+    return {
+        "title": case_title(scene, tiling),
+        "plot": f"trace/{case_id(scene, tiling)}",
+        "uri": images.data_uri(made.path),
+        "still": images.data_uri(made.still),
+        "width": made.width,
+        "height": made.height,
+        "alt": ", ".join(captions),
+        "file": file.name,
+    }

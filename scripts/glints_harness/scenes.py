@@ -3,11 +3,14 @@
 The slot is a stock `<bsdf type="normalmap">` over `<bsdf type="roughconductor">`, so that the file renders anywhere.
 """
 
+from __future__ import annotations
+
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as xml
 
+from . import maps
 from .files import digest_file, digest_text
 from .methods import Slot
 
@@ -36,10 +39,25 @@ class View:
     height: int
     crop: tuple
     """(x, y, width, height)"""
+    frame: int | None = None
+    """Number of the frame in a sequence of turned views; None outside of one."""
+    turn: float = 0.0
+    """Degrees by which the camera goes round what the view's centre shows, about its own upward direction."""
 
     @property
     def pixels(self):
         return self.crop[2] * self.crop[3]
+
+    @property
+    def folder(self):
+        """Where images of this view lie, among those of a scene at a tiling."""
+        return self.name if self.frame is None else f"{self.name}-sequence"
+
+    def middle(self, side):
+        """The part of at most `side` by `side` pixels around the centre, for a quick look at a view's cost."""
+        x, y, width, height = self.crop
+        across, down = min(side, width), min(side, height)
+        return replace(self, crop=(x + (width - across) // 2, y + (height - down) // 2, across, down))
 
 
 @dataclass(frozen=True)
@@ -61,12 +79,17 @@ class Scene:
     @property
     def alpha(self):
         """Beckmann roughness of a flake."""
-        return float(self.first_slot().conductor.find("float[@name='alpha']").get("value"))
+        return self.first_slot().alpha
 
     @property
     def normal_map(self):
         """Path of the normal map."""
         return Path(self.first_slot().filename)
+
+    @property
+    def texels(self):
+        """Number of texels of the normal map."""
+        return maps.texels(self.normal_map)
 
     def first_slot(self):
         """The first glint slot, with parameters put in."""

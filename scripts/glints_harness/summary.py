@@ -1,69 +1,141 @@
-"""Runs that differ only in their seed, taken together."""
+"""What a comparison finds: runs that differ only in their seed, taken together, and everything a report is made of."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from . import metrics
+METRICS = ("rmse", "relmse", "smape", "flip", "mean_error")
+"""Names of the errors, as they stand in records and in `Summary.errors`."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and its 95 % confidence interval; `low == high == value` where no interval can be told."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def certain(self):
+        """Whether the interval is known: one seed, or an infinite pixel, tells none."""
+        return self.low < self.high
+
+
+@dataclass(frozen=True)
+class ErrorSplit:
+    """One error of a method at one point, over its seeds; see `metrics` for how each is defined and estimated.
+
+    For `rmse`, `total` and `noise` are roots, `bias` and `variance` are squares (radiance squared), so that
+    total^2 = bias + variance + noise^2. For `relmse`, total = bias + variance + noise. An estimate of a squared bias may
+    be negative: then it is not told from zero. For `smape` and `flip`, `bias` is the error of the seeds' mean image and
+    `variance` the rest of the total. For `mean_error`, `bias` is the total and `variance` the variance over seeds.
+    """
+
+    total: Estimate
+    bias: Estimate | None
+    """None for a single seed, as is `variance`."""
+    variance: Estimate | None
+    noise: float
+    """What an exact image would measure against this reference."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """One method on one view at one sample count (or time budget), over its seeds."""
+    """One method with one footprint rule on one view at one sample count (or time budget), over its seeds."""
+
+    scene: str
+    tiling: float
+    surface: str
+    """Which reference it is measured against, a key of `methods.SURFACES`."""
+    method: str
+    footprint: str
+    """`sample`, `pixel`, a number of pixels, or `none` for a method that ignores the footprint."""
+    view: str
+    spp: int
+    """Of an equal-time point: of the first seed (all seeds have the same)."""
+    time_budget: float | None
+    budget_includes_build: bool
+    """Whether the time budget has to pay for the data structure, too."""
+    frame: int | None
+    """Number of the frame in the temporal sequence; None outside of it."""
+    runs: tuple
+    """The records, by ascending seed."""
+    errors: dict
+    """Metric name to `ErrorSplit`; empty for a view without a reference of this surface (see `compare`)."""
+    top_percent_share: float | None
+    """Share of the squared error that the worst 1 % of all pixels of all seeds carry. Near one, the tail is heavy:
+    intervals from a few seeds are wide, and may still be too narrow."""
+    seconds: Estimate
+    """Wall-clock seconds of rendering alone."""
+    cpu_seconds: Estimate
+    us_per_sample: Estimate
+    build_seconds: float | None
+    """Of the method's data structure; None for a method without one, as are the next two."""
+    structure_bytes: int | None
+    bins: int | None
+    nonfinite: int
+    """Infinite or undefined pixels of all seeds."""
+    at_reference_noise: bool
+    """Whether at least half of the measured squared error is expected to be the reference's own."""
+    image: str
+    """EXR of the first seed, relative to the output folder."""
+    mean_image: str
+    """EXR of the mean over seeds, relative to the output folder."""
+
+    @property
+    def seconds_with_build(self):
+        """Seconds of rendering and of building the data structure."""
+        return self.seconds.value + (self.build_seconds or 0.0)
+
+
+@dataclass(frozen=True)
+class TemporalResult:
+    """One method over a sequence of frames of an orbiting camera."""
 
     scene: str
     tiling: float
     method: str
-    view: str
+    """A method's name, or `reference`."""
+    footprint: str
     spp: int
-    time_budget: float
-    runs: tuple
-    """The records, by ascending seed."""
-
-    def mean(self, key):
-        """Mean of a field over the seeds; None if a run lacks it."""
-        values = [run[key] for run in self.runs]
-        return None if any(value is None for value in values) else sum(values) / len(values)
-
-    @property
-    def rmse(self):
-        return metrics.root_mean_square([run["rmse"] for run in self.runs])
-
-    @property
-    def relmse(self):
-        return self.mean("relmse")
-
-    @property
-    def seconds(self):
-        return self.mean("seconds")
-
-    @property
-    def mean_error_uncertainty(self):
-        """Standard error of the mean signed error: spread over the seeds and the reference's own; None for one seed."""
-        spread = metrics.standard_error([run["mean_error"] for run in self.runs])
-        return None if spread is None else (spread**2 + self.runs[0]["reference_mean_error"] ** 2) ** 0.5
-
-    @property
-    def at_reference_noise(self):
-        """Whether the squared error, over the seeds, is at most twice the reference's own."""
-        return self.rmse**2 <= 2 * self.runs[0]["reference_rmse"] ** 2
-
-    @property
-    def nonfinite(self):
-        """Infinite or undefined pixels of all seeds."""
-        return sum(run["nonfinite"] for run in self.runs)
-
-    @property
-    def image(self):
-        """The image of the first seed."""
-        return self.runs[0]["image"]
+    frames: int
+    variance: float
+    """Mean over pixels and channels of the variance over time (radiance squared); the reference's without its noise: where
+    that comes out negative, the references are too noisy to tell it from zero."""
+    excess_variance: Estimate
+    """Mean over pixels and channels of the variance over time, minus that of the reference; zero for the reference itself."""
+    max_trace: tuple
+    """Largest luminance in each frame."""
+    images: tuple
+    """EXRs of the frames, relative to the output folder."""
 
 
-def summarise(records):
-    """Summaries in the order of the records."""
-    keys = ("scene", "tiling", "method", "view", "spp", "time_budget")
-    groups = {}
-    for record in records:
-        groups.setdefault(tuple(record[key] for key in keys), []).append(record)
-    return [Summary(*key, tuple(runs)) for key, runs in groups.items()]
+@dataclass
+class Results:
+    """Everything a report is made of."""
+
+    settings: object
+    """`compare.Settings`."""
+    summaries: list
+    records: list
+    """Every run, as in results.json."""
+    references: dict
+    """(scene, tiling, surface, view name) to `reference.Reference`."""
+    sweep: list
+    """Summaries of the first crop at every tiling of the sweep."""
+    temporal: list
+    """`TemporalResult`s, the reference's first."""
+    left_out: list
+    provenance: dict
+    warnings: dict
+    """Message to how often it came."""
+    exposure: float
+    """Stops, for pictures."""
+    seconds: float
+    """Wall-clock seconds so far."""
+    out: Path
 
 
 def select(summaries, **wanted):
@@ -76,6 +148,6 @@ def common_spp(summaries):
     counts = {}
     for item in summaries:
         if item.view != "frame" and item.time_budget is None:
-            counts.setdefault((item.scene, item.tiling, item.method, item.view), set()).add(item.spp)
+            counts.setdefault((item.scene, item.tiling, item.method, item.footprint, item.view), set()).add(item.spp)
     shared = set.intersection(*counts.values()) if counts else set()
     return max(shared, default=None)

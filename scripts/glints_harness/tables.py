@@ -1,42 +1,99 @@
-"""The table that a comparison ends with on the terminal."""
+"""The tables that a comparison ends with on the terminal; the report has them in full."""
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from .report import bytes_text, number, percent, signed
+from . import paper
+from .report_text import bytes_text, number, percent, seconds_text
+from .summary import common_spp, select
+
+FLAT, OURS = "glints_yan16_flat", "glints_ibm"
 
 
-def cost_table(rows, spp):
-    """The rows of `report.costs` as a table."""
-    caption = f"s/frame, µs/sample, × normalmap (processor time): frames. Errors: crops at {spp} spp, ≈ mostly the reference's own noise."
-    table = Table(caption=caption, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), caption_justify="left")
-    table.add_column("scene", no_wrap=True)
-    table.add_column("method", no_wrap=True)
-    for name in ("build", "memory", "s/frame", "µs/sample", "× normalmap", "RMSE", "rel. MSE", "mean error"):
-        table.add_column(name, justify="right", no_wrap=name != "× normalmap")
+def cost_table(results):
+    """Build time, memory, times and errors by scene, tiling, method and footprint rule."""
+    spp = common_spp(results.summaries)
+    caption = f"s/frame, µs/sample: frames. Errors: crops at {spp} spp; ≈: mostly the reference's own noise."
+    result = Table(caption=caption, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), caption_justify="left")
+    for name in ("scene", "method", "footprint"):
+        result.add_column(name, no_wrap=True)
+    for name in ("build", "memory", "formula", "s/frame", "µs/sample", "RMSE", "rel. MSE", "FLIP", "mean error"):
+        result.add_column(name, justify="right", no_wrap=True)
     previous = None
-    for row in rows:
-        if previous not in (None, (row["scene"], row["tiling"])):
-            table.add_section()
-        previous = (row["scene"], row["tiling"])
-        table.add_row(*cells(row))
-    return table
+    for curve, items in curves(results.summaries).items():
+        if previous not in (None, curve[:2]):
+            result.add_section()
+        previous = curve[:2]
+        result.add_row(*cost_row(results, items, spp))
+    return result
 
 
-def cells(row):
+def curves(summaries):
+    """(scene, tiling, method, footprint) to summaries."""
+    found = {}
+    for item in summaries:
+        found.setdefault((item.scene, item.tiling, item.method, item.footprint), []).append(item)
+    return found
+
+
+def cost_row(results, items, spp):
     """One row's texts."""
-    build = row["build_seconds"]
-    relative = row["mean_error"] / row["mean_reference"] if row["mean_reference"] else None
-    invalid = f" ({row['nonfinite']} invalid pixels)" if row["nonfinite"] else ""
+    first = items[0]
+    frame = next((item for item in items if item.view == "frame"), None)
+    crops = [item for item in items if item.errors and item.spp == spp and item.time_budget is None]
     return (
-        f"{row['scene']} x{row['tiling']:g}",
-        row["method"].name,
-        "–" if build is None else f"{build:.2f} s",
-        bytes_text(row["structure_bytes"]),
-        number(row["frame_seconds"]),
-        number(row["us_per_sample"]),
-        number(row["ratio"]),
-        number(row["rmse"]) + (" ≈" if row["at_reference_noise"] else ""),
-        number(row["relmse"]),
-        (percent(relative) if relative is not None else signed(row["mean_error"])) + invalid,
+        f"{first.scene} x{first.tiling:g}",
+        first.method,
+        first.footprint,
+        seconds_text(first.build_seconds),
+        bytes_text(first.structure_bytes),
+        bytes_text(formula_bytes(results, first)),
+        number(frame and frame.seconds.value),
+        number(frame and frame.us_per_sample.value),
+        error_text(crops, "rmse") + (" ≈" if crops and all(item.at_reference_noise for item in crops) else ""),
+        error_text(crops, "relmse"),
+        error_text(crops, "flip"),
+        mean_error_text(results, crops) + invalid_text(items),
     )
+
+
+def formula_bytes(results, item):
+    """What a method's formula says about its memory; None without one."""
+    method, scene = results.settings.method(item.method), results.settings.scene(item.scene)
+    return method.memory and round(method.memory.structure_bytes(scene.texels, item.bins))
+
+
+def error_text(crops, metric):
+    """Mean of an error over the crops."""
+    return number(sum(item.errors[metric].total.value for item in crops) / len(crops) if crops else None)
+
+
+def mean_error_text(results, crops):
+    """Mean error relative to the mean of the references, over the crops."""
+    if not crops:
+        return "–"
+    keys = [(item.scene, item.tiling, item.surface, item.view) for item in crops]
+    mean = sum(results.references[key].mean.mean() for key in keys)
+    return percent(sum(item.errors["mean_error"].total.value for item in crops) / mean)
+
+
+def invalid_text(items):
+    """How many pixels are not finite, if any are."""
+    count = sum(item.nonfinite for item in items)
+    return f" ({count} invalid pixels)" if count else ""
+
+
+def ratio_lines(results):
+    """The inverse bin map beside Yan's flat elements and the paper's ratios, a line for each scene that has both."""
+    lines = []
+    for scene in results.settings.scenes:
+        flat = select(results.summaries, scene=scene.name, method=FLAT)
+        ours = select(results.summaries, scene=scene.name, method=OURS)
+        if flat and ours:
+            memory = flat[0].structure_bytes / ours[0].structure_bytes
+            build = flat[0].build_seconds / ours[0].build_seconds
+            lines.append(
+                f"{scene.name}: {FLAT} takes {number(memory, 2)} times the memory of {OURS} (paper: {paper.MEMORY_RATIO}) and "
+                f"{number(build, 2)} times the build time (paper: {paper.BUILD_RATIO})"
+            )
+    return lines

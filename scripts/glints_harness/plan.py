@@ -1,0 +1,257 @@
+"""What a comparison consists of: its settings, and the runs and references that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from .methods import SURFACES
+from .render import Lighting, Run
+from .scenes import View, scene_digest
+
+FIRST_SEED = 1
+"""Seeds of measured runs count up from here; those of the references lie far away."""
+
+SWEEP_SPP = 4
+SEQUENCE_SPP = 4
+"""Samples per pixel of the tiling sweep and of the temporal sequence."""
+
+MINOR_SHARE = 1 / 3
+SEQUENCE_SHARE = 1 / 5
+"""Length of a reference relative to a crop's: that of a frame, of another surface than the texels, or of a tiling that
+only the sweep visits; that of one frame of the sequence."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to compare. Sizes in pixels, times in seconds."""
+
+    scenes: Sequence
+    methods: Sequence
+    tilings: Sequence[float] = (1.0, 8.0)
+    spps: Sequence[int] = (1, 4, 16)
+    times: Sequence[float] = ()
+    """Budgets for rendering alone, in equal-time comparisons."""
+    times_with_build: Sequence[float] = ()
+    """Budgets that building the data structure is paid from, too."""
+    footprints: Sequence[str] | None = None
+    """Footprint rules for every method that filters; None: `sample`, and also `pixel` for the inverse bin map."""
+    seeds: int = 8
+    size: int = 800
+    """Width and height of the frame that the crops are cut from."""
+    frame_size: int = 400
+    frame_spp: int = 4
+    lighting: Lighting = field(default_factory=Lighting)
+    """Of the crops: direct light, which is what the methods filter, unless asked for otherwise."""
+    frame_depth: int = 3
+    """Longest path of the frames, which are there to be looked at and to be timed."""
+    sweep: Sequence[float] = ()
+    """Tilings of the sweep over texels per pixel: first crop, first scene."""
+    frames: int = 0
+    """Length of the temporal sequence: middle of the first crop, first scene, first tiling."""
+    orbit: float = 1.0
+    """Degrees that the camera turns in the whole sequence."""
+    reference_seconds: float = 8.0
+    """Least rendering time of a crop's reference; see `MINOR_SHARE` for others."""
+    reference_spp: int | None = None
+    """Least samples per pixel of every reference, instead of its time."""
+    limit: float | None = None
+    """Seconds for the whole comparison; None: no limit. Points that are predicted not to fit are left out."""
+    fresh: bool = False
+    """Whether to render again what is kept."""
+    out: Path = Path("out/compare")
+    cache: Path = Path(".cache")
+    """Folder of finished runs and references."""
+
+    def lighting_of(self, view, rule="none"):
+        """The integrator of a view, with a footprint rule."""
+        depth = self.frame_depth if is_frame(view) else self.lighting.max_depth
+        return replace(self.lighting, max_depth=depth, footprint=rule)
+
+    def rules(self, method):
+        """The footprint rules that a method is run with."""
+        if not method.filters:
+            return ("none",)
+        if self.footprints is not None:
+            return tuple(self.footprints)
+        return ("sample", "pixel") if method.name == "glints_ibm" else ("sample",)
+
+    def views(self, scene):
+        """The views of a scene: the frame, then the crops."""
+        return list(scene.views(self.size, self.frame_size).values())
+
+    def first_crop(self, scene):
+        """The crop of sweep and sequence."""
+        return self.views(scene)[1]
+
+    def sequence(self, scene, tiling):
+        """The views of the temporal sequence: the camera goes round evenly, the first frame is unturned.
+
+        None outside of the first scene at the first tiling, nor if no method has the surface of their references.
+        """
+        wanted = (scene, tiling) == (self.scenes[0], self.tilings[0])
+        if not wanted or all(method.surface != "texels" for method in self.methods):
+            return []
+        crop = self.first_crop(scene)
+        crop = crop.middle(max(1, crop.crop[2] // 2))
+        step = self.orbit / max(1, self.frames - 1)
+        return [replace(crop, frame=index, turn=index * step) for index in range(self.frames)]
+
+    def method(self, name):
+        """The method of a name."""
+        return next(method for method in self.methods if method.name == name)
+
+    def scene(self, name):
+        """The scene of a name."""
+        return next(scene for scene in self.scenes if scene.name == name)
+
+
+def is_frame(view):
+    """Whether a view is the whole film."""
+    return view.name == "frame"
+
+
+def is_measured(view):
+    """Whether images of a view are held against a reference, by `measure`: those of crops are.
+
+    Frames are there to be looked at and to be timed; the sequence has a measure of its own (`temporal`).
+    """
+    return not is_frame(view) and view.frame is None
+
+
+class Texts:
+    """Resolved scenes and their digests; files are read once."""
+
+    def __init__(self):
+        self.kept = {}
+
+    def of(self, scene, method, tiling):
+        """(text, digest) of a scene with a method in its slot."""
+        key = (scene.name, method.name, tiling)
+        if key not in self.kept:
+            text = scene.text(method, tiling)
+            self.kept[key] = (text, scene_digest(text))
+        return self.kept[key]
+
+
+# ---- runs ------------------------------------------------------------------------------------------------------------
+
+
+class RunPlan:
+    """Every run, as lists of three purposes that may share runs; points stand by falling importance."""
+
+    def __init__(self, settings):
+        self.settings = settings
+        self.main, self.sweep, self.sequence = [], [], []
+        for scene in settings.scenes:
+            for tiling in settings.tilings:
+                for method in settings.methods:
+                    self.main += self.main_runs(scene, tiling, method)
+        texels = [method for method in settings.methods if method.surface == "texels"]
+        first = settings.scenes[0]
+        for method in texels:
+            self.sequence += self.sequence_runs(first, method)
+        for tiling in settings.sweep:
+            for method in texels:
+                self.sweep += self.sweep_runs(first, tiling, method)
+
+    @property
+    def runs(self):
+        """All of them, each once."""
+        return list(dict.fromkeys((*self.main, *self.sequence, *self.sweep)))
+
+    def main_runs(self, scene, tiling, method):
+        """Few samples in the crops, the frame, more samples, equal time."""
+        settings = self.settings
+        frame, *crops = settings.views(scene)
+        rules = settings.rules(method)
+
+        def run(view, rule, spp, seed, **more):
+            return Run(scene.name, tiling, method.name, view, settings.lighting_of(view, rule), spp, seed, **more)
+
+        def crop_runs(spp=None, **more):
+            return [run(crop, rule, spp, seed, **more) for rule in rules for crop in crops for seed in self.seeds()]
+
+        few = [item for spp in settings.spps[:1] for item in crop_runs(spp)]
+        whole = [run(frame, rule, settings.frame_spp, FIRST_SEED) for rule in rules]
+        more = [item for spp in settings.spps[1:] for item in crop_runs(spp)]
+        timed = [item for budget in settings.times for item in crop_runs(time_budget=budget)]
+        paid = [
+            item
+            for budget in settings.times_with_build
+            for item in crop_runs(time_budget=budget, budget_includes_build=True)
+        ]
+        return [*few, *whole, *more, *timed, *paid]
+
+    def seeds(self):
+        """The seeds of every point."""
+        return range(FIRST_SEED, FIRST_SEED + self.settings.seeds)
+
+    def sweep_runs(self, scene, tiling, method):
+        """The first crop at one sample count."""
+        crop = self.settings.first_crop(scene)
+        return [
+            Run(scene.name, tiling, method.name, crop, self.settings.lighting_of(crop, rule), SWEEP_SPP, seed)
+            for rule in self.settings.rules(method)
+            for seed in self.seeds()
+        ]
+
+    def sequence_runs(self, scene, method):
+        """One run for each frame of the sequence, each with a seed of its own."""
+        settings, tiling = self.settings, self.settings.tilings[0]
+        return [
+            Run(
+                scene.name,
+                tiling,
+                method.name,
+                view,
+                settings.lighting_of(view, rule),
+                SEQUENCE_SPP,
+                FIRST_SEED + view.frame,
+            )
+            for rule in settings.rules(method)
+            for view in settings.sequence(scene, tiling)
+        ]
+
+
+# ---- references ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ReferenceKey:
+    """What a reference is of."""
+
+    scene: str
+    tiling: float
+    surface: str
+    view: View
+
+    @property
+    def file_name(self):
+        """The name of the mean's image, as `Run.file_name`."""
+        folder = f"{self.scene}-x{self.tiling:g}/{self.view.folder}"
+        frame = "" if self.view.frame is None else f"-frame{self.view.frame:03d}"
+        return f"{folder}/reference-{self.surface}{frame}.exr"
+
+
+def references(settings):
+    """(key, share of a crop's time) of every reference, each once.
+
+    A frame has a reference of the texels only: it is there to be looked at.
+    """
+    wanted = {}
+    surfaces = [name for name in SURFACES if any(method.surface == name for method in settings.methods)]
+    for scene in settings.scenes:
+        frame, *crops = settings.views(scene)
+        for tiling in settings.tilings:
+            for surface in surfaces:
+                share = 1.0 if surface == "texels" else MINOR_SHARE
+                wanted.update({ReferenceKey(scene.name, tiling, surface, crop): share for crop in crops})
+            wanted[ReferenceKey(scene.name, tiling, "texels", frame)] = MINOR_SHARE
+            for view in settings.sequence(scene, tiling):
+                wanted[ReferenceKey(scene.name, tiling, "texels", view)] = SEQUENCE_SHARE
+    first = settings.scenes[0]
+    for tiling in settings.sweep if "texels" in surfaces else ():
+        wanted.setdefault(ReferenceKey(first.name, tiling, "texels", settings.first_crop(first)), MINOR_SHARE)
+    return list(wanted.items())

@@ -1,0 +1,39 @@
+"""Processes that draw plots and compute FLIP maps while the report's pictures are packed. What they run imports neither
+Mitsuba nor the rest of the harness, so that they start quickly."""
+
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+
+import numpy as np
+
+THREADS = "OMP_NUM_THREADS"
+
+
+@contextmanager
+def pool():
+    """A pool with a process for every processor, each with a single thread of OpenMP.
+
+    FLIP's library starts a thread for each processor, and these wait for each other in busy loops: with all processors
+    at work it would get ten times slower. It reads the variable when it is loaded.
+    """
+    workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    before = os.environ.get(THREADS)
+    os.environ[THREADS] = "1"
+    try:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as started:
+            yield started
+    finally:
+        del os.environ[THREADS]
+        if before is not None:
+            os.environ[THREADS] = before
+
+
+def flip_map(image, reference, exposures):
+    """HDR-FLIP of every pixel, array (height, width) of [0, 1]; its mean is `metrics.flip`."""
+    import flip_evaluator
+
+    pair = (np.ascontiguousarray(np.maximum(item, 0), dtype=np.float32) for item in (reference, image))
+    found, _, _ = flip_evaluator.evaluate(*pair, "HDR", applyMagma=False, parameters={"numExposures": exposures})
+    return found[..., 0]
