@@ -12,9 +12,11 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from glints_harness import images, plan, plots, report, report_tables, report_text
+from glints_harness import images, metrics, plan
 from glints_harness.methods import METHODS
 from glints_harness.reference import Reference
+from glints_harness.report import page as report_page
+from glints_harness.report import pictures, plots, tables, text
 from glints_harness.scenes import View
 from glints_harness.summary import METRICS, ErrorSplit, Estimate, Results, Summary, TemporalResult
 from PIL import Image
@@ -181,7 +183,7 @@ def written(tmp_path_factory):
     """A report of made-up results: the results and the path of the page."""
     mi.set_variant("scalar_rgb")
     results = make_results(tmp_path_factory.mktemp("report"))
-    return results, report.write(results)
+    return results, report_page.write(results)
 
 
 # ---- data ------------------------------------------------------------------------------------------------------------
@@ -203,20 +205,20 @@ def test_pixels_are_rounded_to_the_stated_precision_and_keep_their_exponent(mant
 
 
 def test_numbers_for_people():
-    texts = [report_text.number(value) for value in (None, 0.0, 1234.0, 123456.0, 1e-7, -2.5, math.inf, math.nan)]
+    texts = [text.number(value) for value in (None, 0.0, 1234.0, 123456.0, 1e-7, -2.5, math.inf, math.nan)]
     assert texts == ["–", "0", "1230", "123000", "1·10⁻⁷", "−2.5", "∞", "undefined"]
-    assert report_text.signed(0.5) == "+0.5" and report_text.percent(-0.123) == "−12.3 %"
-    assert [report_text.bytes_text(size) for size in (None, 12, 35.7e6, 3.24e9)] == ["–", "12 B", "35.7 MB", "3.24 GB"]
-    assert report_text.with_interval(Estimate(2.0, 1.5, 3.0)) == "2 [1.5, 3]"
-    assert report_text.with_interval(Estimate(2.0, 2.0, 2.0)) == "2"
+    assert text.signed(0.5) == "+0.5" and text.percent(-0.123) == "−12.3 %"
+    assert [text.bytes_text(size) for size in (None, 12, 35.7e6, 3.24e9)] == ["–", "12 B", "35.7 MB", "3.24 GB"]
+    assert text.with_interval(Estimate(2.0, 1.5, 3.0)) == "2 [1.5, 3]"
+    assert text.with_interval(Estimate(2.0, 2.0, 2.0)) == "2"
 
 
 def test_tables_2_to_4_show_ours_beside_the_papers(written):
     results, _ = written
-    memory = report_tables.table_2_or_3(results, "structure_bytes", "90×").rows[0]
+    memory = tables.table_2_or_3(results, "structure_bytes", "90×").rows[0]
     assert [(cell.text, cell.note) for cell in memory[1:3]] == [("10 MB", "paper 36 MB"), ("30 MB", "paper 3.2 GB")]
     assert (memory[-1].text, memory[-1].note) == ("3×", "paper 90×")
-    table = report_tables.table_4(results)
+    table = tables.table_4(results)
     column = [column.heading for column in table.columns].index("0.00707")
     assert [row[column].text for row in table.rows] == ["333²", "10 MB"]
     assert table.rows[1][1].note == "paper 40 MB"
@@ -301,7 +303,7 @@ def test_a_comparison_of_one_method_and_one_seed_has_a_page_too(browser, tmp_pat
     results.settings = dataclasses.replace(results.settings, methods=(METHODS["normalmap"],))
     results.references = {key: kept for key, kept in results.references.items() if key[2:] == ("texels", "crop1")}
     results.sweep, results.temporal, results.left_out, results.warnings = [], [], [], {}
-    with opened(browser, report.write(results), 800, 600) as page:
+    with opened(browser, report_page.write(results), 800, 600) as page:
         assert page.locator("#stage-label").inner_text() == "Reference · texels"
         page.evaluate("choose({ case: 1, pinned: 0 })")
         assert page.locator("#stage-label").inner_text() == "Stock normalmap"
@@ -348,7 +350,7 @@ def test_the_browser_decodes_the_very_pixels_that_were_packed(page, written):
         "(async () => [currentShot().data, Array.from(new Uint32Array((await currentShot().pixels()).buffer))])()"
     )
     item = next(s for s in results.summaries if (s.tiling, s.view, s.spp) == (8, "crop1", 1))
-    expected = images.rounded(images.read_exr(results.out / item.image), report.report_pictures.CROP_MANTISSA)
+    expected = images.rounded(images.read_exr(results.out / item.image), pictures.CROP_MANTISSA)
     np.testing.assert_array_equal(np.array(found[1], dtype=np.uint32).view(np.float32), expected.ravel())
 
 
@@ -474,7 +476,7 @@ def test_error_maps_show_errors_against_the_methods_own_surface(page, written):
     settle(page)
     assert np.any(pixels(page) != plain) and page.locator("#scale").is_visible()
     flip = page.evaluate("(async () => Array.from(await currentShot().flipMap()))()")
-    assert np.mean(flip) == pytest.approx(report.metrics.flip(image, truth), abs=0.01)
+    assert np.mean(flip) == pytest.approx(metrics.flip(image, truth), abs=0.01)
 
 
 def test_plots_show_values_on_hover_and_follow_the_metric(page):

@@ -7,13 +7,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from . import render, report, tables
+from . import render, tables
 from .compare import Comparison
 from .executors import START_WORKERS, Dask, Local
 from .methods import METHODS, SURFACES, check_plugins, choose
 from .plan import SEQUENCE_SPP, SWEEP_SPP, Settings
 from .progress import Display, console
 from .render import Lighting
+from .report import page
 from .scenes import find_scenes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -254,7 +255,7 @@ def main(arguments=None):
             written = results.out / "results.json"
             if not options.no_report:
                 display.say("report")
-                written = report.write(results)
+                written = page.write(results)
     finally:
         place.close()
     console.print(tables.cost_table(results), *tables.ratio_lines(results), sep="\n")

@@ -4,7 +4,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from . import paper
-from .report_text import bytes_text, number, percent, seconds_text
+from .report.text import bytes_text, number, percent, seconds_text
 from .summary import common_spp, select
 
 FLAT, OURS = "glints_yan16_flat", "glints_ibm"

@@ -1,8 +1,8 @@
 """Which plots the report has."""
 
+from ..summary import select
 from . import plots
-from .report_text import case_id, case_title, number, sample_text, seconds_text, short_label, view_title, with_interval
-from .summary import select
+from .text import case_id, case_title, number, sample_text, seconds_text, short_label, view_title, with_interval
 
 METRIC_TITLES = {
     "rmse": "RMSE",

@@ -16,7 +16,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from .files import replacing, write_text
+from ..files import replacing, write_text
 
 STYLES = {
     "glints_ibm": ("#0072B2", "o", "-"),

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from . import images
-from .files import replacing
+from .. import images
+from ..files import replacing
 
 SCALE = 3
 """Screen pixels for each pixel of a small picture."""

@@ -4,30 +4,14 @@ Mitsuba nor the rest of the harness, so that they start quickly."""
 import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 
 import numpy as np
 
-THREADS = "OMP_NUM_THREADS"
 
-
-@contextmanager
 def pool():
-    """A pool with a process for every processor, each with a single thread of OpenMP.
-
-    FLIP's library starts a thread for each processor, and these wait for each other in busy loops: with all processors
-    at work it would get ten times slower. It reads the variable when it is loaded.
-    """
+    """A pool with a process for every processor."""
     workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    before = os.environ.get(THREADS)
-    os.environ[THREADS] = "1"
-    try:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as started:
-            yield started
-    finally:
-        del os.environ[THREADS]
-        if before is not None:
-            os.environ[THREADS] = before
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 
 def flip_map(image, reference, exposures):

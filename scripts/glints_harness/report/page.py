@@ -9,11 +9,12 @@ import matplotlib
 import numpy as np
 from markupsafe import Markup
 
-from . import animation, images, metrics, paper, plots, report_pictures, report_plots, report_tables, report_workers
-from .files import json_ready, write_text
-from .report_plots import AXES, METRIC_TITLES
-from .report_text import case_id, case_title, long_label, number, short_label
-from .summary import select
+from .. import images, metrics, paper
+from ..files import json_ready, write_text
+from ..summary import select
+from . import animation, curves, pictures, plots, tables, workers
+from .curves import AXES, METRIC_TITLES
+from .text import case_id, case_title, long_label, number, short_label
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -35,9 +36,9 @@ SCHEME = {
 def write(results):
     """Write index.html, plots/ and animations/ into the results' folder; returns the path of index.html."""
     chosen = all_plots(results)
-    with report_workers.pool() as pool:
+    with workers.pool() as pool:
         drawn = {identity: pool.submit(plots.draw, plot, results.out / "plots") for identity, plot in chosen.items()}
-        gallery = report_pictures.gallery(results, pool)
+        gallery = pictures.gallery(results, pool)
         sequences = [sequence(results, *case) for case in temporal_cases(results)]
         packed = {identity: packed_plot(future.result()) for identity, future in drawn.items()}
         gallery.finish()
@@ -55,7 +56,7 @@ def write(results):
             for scene in results.settings.scenes
             for tiling in results.settings.tilings
         ],
-        **tables(results),
+        **page_tables(results),
         sweep_plots=[identity for identity in chosen if identity.startswith("sweep/")],
         largest_tiling=max((item.tiling for item in results.sweep), default=1),
         sequences=sequences,
@@ -71,7 +72,7 @@ def write(results):
 
 def precision():
     """How far a picture's pixels may be off, in percent: half of the last stored bit."""
-    bits = {"crop": report_pictures.CROP_MANTISSA, "frame": report_pictures.FRAME_MANTISSA}
+    bits = {"crop": pictures.CROP_MANTISSA, "frame": pictures.FRAME_MANTISSA}
     return {view: number(100 * 2.0 ** -(mantissa + 1), 2) for view, mantissa in bits.items()}
 
 
@@ -110,9 +111,9 @@ def colour_tables():
 
 def all_plots(results):
     """{identifier of the page's script element: `plots.Plot`}."""
-    found = {f"plot/{'/'.join(key)}": plot for key, plot in report_plots.convergence_plots(results).items()}
-    found.update({f"sweep/{'/'.join(key)}": plot for key, plot in report_plots.sweep_plots(results).items()})
-    found.update({f"trace/{case}": plot for case, plot in report_plots.trace_plots(results).items()})
+    found = {f"plot/{'/'.join(key)}": plot for key, plot in curves.convergence_plots(results).items()}
+    found.update({f"sweep/{'/'.join(key)}": plot for key, plot in curves.sweep_plots(results).items()})
+    found.update({f"trace/{case}": plot for case, plot in curves.trace_plots(results).items()})
     return found
 
 
@@ -168,7 +169,7 @@ def frame_entry(gallery, view):
 def strip(gallery, group):
     """The paper's four methods and the reference at one sample count."""
     entries = []
-    for method, name in report_tables.COLUMNS_OF_FIGURE_7.items():
+    for method, name in tables.COLUMNS_OF_FIGURE_7.items():
         mine = [index for index in group["shots"] if gallery.shots[index]["method"] == method]
         gone = "left out" if any(absent["method"] == method for absent in group["absent"]) else "not compared"
         entries.append(strip_entry(gallery, name, mine, gone))
@@ -190,22 +191,22 @@ def strip_entry(gallery, name, shots, gone):
 # ---- tables and sequences --------------------------------------------------------------------------------------------
 
 
-def tables(results):
+def page_tables(results):
     """All tables of the page by the names that its template has for them."""
     formulas = {}
     for method in results.settings.methods:
         if method.memory is not None:
             formulas.setdefault(method.memory.text, []).append(method.label)
     return {
-        "table_2": report_tables.table_2_or_3(results, "structure_bytes", f"{paper.MEMORY_RATIO}×"),
-        "table_3": report_tables.table_2_or_3(results, "build_seconds", f"nearly {paper.BUILD_RATIO}×"),
-        "table_4": report_tables.table_4(results),
+        "table_2": tables.table_2_or_3(results, "structure_bytes", f"{paper.MEMORY_RATIO}×"),
+        "table_3": tables.table_2_or_3(results, "build_seconds", f"nearly {paper.BUILD_RATIO}×"),
+        "table_4": tables.table_4(results),
         "error_cases": error_cases(results),
-        "sweep_table": report_tables.sweep_table(results),
-        "temporal_table": report_tables.temporal_table(results),
-        "cost_table": report_tables.cost_table(results),
+        "sweep_table": tables.sweep_table(results),
+        "temporal_table": tables.temporal_table(results),
+        "cost_table": tables.cost_table(results),
         "formulas": formulas,
-        "left_out": report_tables.left_out_table(results),
+        "left_out": tables.left_out_table(results),
     }
 
 
@@ -223,7 +224,7 @@ def error_cases(results):
                     "id": case_id(scene.name, tiling),
                     "title": case_title(scene.name, tiling),
                     "views": sorted({item.view for item in mine if item.view != "frame"}),
-                    "tables": {metric: report_tables.error_table(mine, metric) for metric in METRIC_TITLES},
+                    "tables": {metric: tables.error_table(mine, metric) for metric in METRIC_TITLES},
                 }
             )
     return cases

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from . import images, metrics
-from .files import digest_text
-from .report_text import (
+from .. import images, metrics
+from ..files import digest_text
+from ..summary import select
+from .text import (
     case_id,
     case_title,
     long_label,
@@ -21,8 +22,7 @@ from .report_text import (
     view_title,
     with_interval,
 )
-from .report_workers import flip_map
-from .summary import select
+from .workers import flip_map
 
 CROP_MANTISSA = 7
 """Stored bits of the mantissa of a crop's pixels: values are right to 0.4 %, a third of an 8-bit step of brightness."""

@@ -2,7 +2,7 @@
 
 import math
 
-from .methods import METHODS
+from ..methods import METHODS
 
 
 def number(value, digits=3):

@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 from types import SimpleNamespace
 
-from . import paper
-from .report_plots import METRIC_TITLES
-from .report_text import (
+from .. import paper
+from ..summary import select
+from ..tables import formula_bytes
+from .curves import METRIC_TITLES
+from .text import (
     bytes_text,
     case_title,
     interval,
@@ -17,8 +19,6 @@ from .report_text import (
     signed,
     view_title,
 )
-from .summary import select
-from .tables import formula_bytes
 
 COLUMNS_OF_FIGURE_7 = {
     "glints_ibm": "Ours",
