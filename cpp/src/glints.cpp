@@ -156,8 +156,8 @@ float Brdf::ndf(const Footprint &footprint, const Vec3 &h) const noexcept {
 
 Statistics Brdf::statistics() const {
     auto s = m_impl->brdf->statistics();
-    return {std::string(s.method), s.alpha,          s.structure_bytes, s.build_seconds, s.bins,
-            s.masking_alpha_u,     s.masking_alpha_v};
+    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds, s.bins,
+            s.refinement,          s.masking_alpha_u, s.masking_alpha_v};
 }
 
 } // namespace glints

@@ -20,6 +20,7 @@ from .scenes import find_scenes
 ROOT = Path(__file__).resolve().parents[2]
 
 DEFAULT_SPPS = (1, 4, 16)
+DEFAULT_TIMES = (0.2,)
 DEFAULT_LIMIT = 430.0
 """Seconds; see `Settings.limit`. Keeps the default comparison under eight minutes, the report included."""
 
@@ -60,7 +61,12 @@ def parser():
     )
     size = result.add_argument_group("how much").add_argument
     size("--spp", type=numbers(int), help="samples per pixel of the crops (default: 1,4,16)")
-    size("--time", type=numbers(float), default=(), help="equal-time budgets in seconds a crop, rendering alone")
+    size(
+        "--time",
+        type=numbers(float),
+        default=(),
+        help="equal-time budgets in seconds a crop, rendering alone (default: 0.2)",
+    )
     size(
         "--time-with-build",
         type=numbers(float),
@@ -201,7 +207,7 @@ def settings(options):
         methods=methods,
         tilings=options.tiling,
         spps=options.spp or (() if options.time or options.time_with_build else DEFAULT_SPPS),
-        times=options.time,
+        times=options.time or (DEFAULT_TIMES if limited else ()),
         times_with_build=options.time_with_build,
         footprints=options.footprint,
         seeds=options.seeds,

@@ -10,12 +10,13 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from . import measure, provenance, temporal
+from . import measure, provenance, structures, temporal
 from .files import Damaged, duplicate, write_csv, write_exr, write_json
-from .jobs import LeftOut, Part, ReferenceJob, RenderJob, Wanted
+from .jobs import LOAD_SECONDS, LeftOut, Part, ReferenceJob, RenderJob, Wanted
 from .methods import SURFACES
 from .plan import ReferenceKey, RunPlan, Settings, Texts, is_measured, references
 from .reference import Reference, ReferenceStore
+from .render import STRUCTURE
 from .runs import RunCache, description
 from .summary import Results
 
@@ -65,6 +66,7 @@ class Comparison:
             },
             sweep=measure.of_points(found, self.plan.sweep),
             temporal=temporal.results(self),
+            table_4=structures.of_table_4(self.settings),
             left_out=self.left_out,
             provenance=provenance.provenance(),
             warnings=self.warnings,
@@ -82,6 +84,17 @@ class Comparison:
         self.progress.expect(expected + self.image_seconds * len(self.plan.runs) + REPORT_SECONDS)
         self.carry_out(reference_jobs, lambda _jobs: math.inf)
         self.carry_out(render_jobs, self.share)
+        self.use_what_is_left()
+
+    def use_what_is_left(self):
+        """Give the time that quick methods did not need to points that were left out, until nothing more fits."""
+        before = None
+        while self.settings.limit is not None and self.left_out and len(self.left_out) != before:
+            jobs = self.render_jobs()
+            if self.time_left() < 2 * LOAD_SECONDS * len(jobs):
+                return
+            before, self.left_out = len(self.left_out), []
+            self.carry_out(jobs, self.share)
 
     def carry_out(self, jobs, share):
         """Hand jobs to the executor, and keep what comes back."""
@@ -102,9 +115,12 @@ class Comparison:
         """Seconds for the first of the jobs that are left, by their expected times."""
         if self.settings.limit is None:
             return math.inf
+        return self.time_left() * jobs[0].expected_seconds / sum(job.expected_seconds for job in jobs)
+
+    def time_left(self):
+        """Seconds of the limit that are not owed to what comes after rendering."""
         owed = REPORT_SECONDS + self.image_seconds * sum(is_measured(run.view) for run in self.records)
-        left = self.settings.limit - owed - (time.perf_counter() - self.start)
-        return max(0.0, left) * jobs[0].expected_seconds / sum(job.expected_seconds for job in jobs)
+        return max(0.0, self.settings.limit - owed - (time.perf_counter() - self.start))
 
     def receive(self, outcome):
         """Keep one result."""
@@ -191,7 +207,7 @@ class Comparison:
             "cpu_seconds": kept["cpu_seconds"],
             "us_per_sample": 1e6 * kept["seconds"] / (run.view.pixels * kept["spp"]),
             "load_seconds": kept["load_seconds"],
-            **{key: kept["structure"].get(key) for key in ("structure_bytes", "build_seconds", "bins")},
+            **{key: kept["structure"].get(key) for key in STRUCTURE},
             "image": image.as_posix(),
             "image_digest": kept["image_digest"],
             "scene_digest": kept["run"]["scene_digest"],
@@ -217,6 +233,9 @@ class Comparison:
                 "provenances": self.provenances,
                 "summaries": [listed(summary) for summary in results.summaries],
                 "sweep": [listed(summary) for summary in results.sweep],
+                "table_4": [
+                    {"scene": scene, "alpha": alpha, **item} for (scene, alpha), item in results.table_4.items()
+                ],
                 "temporal": [asdict(item) for item in results.temporal],
                 "references": [self.listed_reference(*item) for item in self.references.items()],
                 "left_out": results.left_out,

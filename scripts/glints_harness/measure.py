@@ -136,7 +136,7 @@ def summary(comparison, runs, point, measured):
         seconds=over_seeds(records, "seconds"),
         cpu_seconds=over_seeds(records, "cpu_seconds"),
         us_per_sample=over_seeds(records, "us_per_sample"),
-        **{key: records[0][key] for key in ("build_seconds", "structure_bytes", "bins")},
+        **{key: records[0][key] for key in render.STRUCTURE},
         nonfinite=sum(record["nonfinite"] for record in records),
         at_reference_noise=rmse is not None and bool(rmse.total.value**2 <= 2 * rmse.noise**2),
         image=records[0]["image"],

@@ -48,9 +48,9 @@ class Formula:
     """What a data structure's memory should be."""
 
     text: str
-    """For people: N texels, b bins a side."""
-    structure_bytes: Callable[[int, int], float]
-    """Bytes, from the number of texels and of bins a side."""
+    """For people: N texels, b bins a side, r x r elements a texel."""
+    structure_bytes: Callable[[int, int, int], float]
+    """Bytes, from N, b and r."""
 
 
 @dataclass(frozen=True)
@@ -144,13 +144,12 @@ def glints(name, label, kind, memory, parameters=None, **more):
 
 BIN_MAP_MEMORY = Formula(
     "8 N + 4.2 b² + 0.6 N: two maps of 4 bytes a texel, the index, and a forest of 3 bytes a leaf of about 5 texels",
-    lambda texels, bins: 8.6 * texels + 4.2 * bins**2,
+    lambda texels, bins, _: 8.6 * texels + 4.2 * bins**2,
 )
-NORMALS_MEMORY = Formula("12 N: one normal a texel", lambda texels, _bins: 12 * texels)
-FLAT_MEMORY = Formula("14 N: one element a texel, with its tree", lambda texels, _bins: 14 * texels)
+NORMALS_MEMORY = Formula("12 N: one normal a texel", lambda texels, *_: 12 * texels)
+FLAT_MEMORY = Formula("14 N: one element a texel, with its tree", lambda texels, *_: 14 * texels)
 CURVED_MEMORY = Formula(
-    "30 r² N: r² elements a texel, with their tree; the number is that of smooth maps (r = 1), others get r = 2",
-    lambda texels, _bins: 30 * texels,
+    "30 r² N: r² elements a texel, with their tree", lambda texels, _bins, refinement: 30 * refinement**2 * texels
 )
 
 METHODS = {

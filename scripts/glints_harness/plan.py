@@ -162,7 +162,7 @@ class RunPlan:
         return list(dict.fromkeys((*self.main, *self.sequence, *self.sweep)))
 
     def main_runs(self, scene, tiling, method):
-        """Few samples in the crops, the frame, more samples, equal time."""
+        """Few samples in the crops, the frame, equal time, more samples."""
         settings = self.settings
         frame, *crops = settings.views(scene)
         rules = settings.rules(method)
@@ -182,7 +182,7 @@ class RunPlan:
             for budget in settings.times_with_build
             for item in crop_runs(time_budget=budget, budget_includes_build=True)
         ]
-        return [*few, *whole, *more, *timed, *paid]
+        return [*few, *whole, *timed, *paid, *more]
 
     def seeds(self):
         """The seeds of every point."""

@@ -169,20 +169,23 @@ class LoadedScene:
         return np.array(widths)
 
 
-def structure(scene):
-    """`structure_bytes`, `build_seconds`, `bins` as the scene's glint BSDFs print them; absent if none has it.
+STRUCTURE = {"structure_bytes": int, "build_seconds": float, "bins": int, "refinement": int}
+"""What glint BSDFs say about their data structures."""
 
-    A method without bins prints 0 of them.
-    """
-    text = "\n".join(str(shape.bsdf()) for shape in scene.shapes())
+
+def structure(scene):
+    """The values of `STRUCTURE` as the scene's glint BSDFs print them; absent if none has it."""
+    return structure_of("\n".join(str(shape.bsdf()) for shape in scene.shapes()))
+
+
+def structure_of(text):
+    """The same of a BSDF's description. A method without bins or elements prints 0 of them."""
     found = {}
-    for name, kind in (("structure_bytes", int), ("build_seconds", float), ("bins", int)):
+    for name, kind in STRUCTURE.items():
         match = re.search(rf"\b{name}\s*[=:]\s*([0-9.eE+-]+)", text)
         if match:
             found[name] = kind(float(match.group(1)))
-    if found.get("bins") == 0:
-        del found["bins"]
-    return found
+    return {name: value for name, value in found.items() if value or name not in ("bins", "refinement")}
 
 
 def collect_warnings():

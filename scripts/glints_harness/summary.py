@@ -75,6 +75,7 @@ class Summary:
     """Of the method's data structure; None for a method without one, as are the next two."""
     structure_bytes: int | None
     bins: int | None
+    refinement: int | None
     nonfinite: int
     """Infinite or undefined pixels of all seeds."""
     at_reference_noise: bool
@@ -127,6 +128,8 @@ class Results:
     """Summaries of the first crop at every tiling of the sweep."""
     temporal: list
     """`TemporalResult`s, the reference's first."""
+    table_4: dict
+    """(scene, flake roughness) to what `render.STRUCTURE` names of an inverse bin map, at the paper's roughnesses."""
     left_out: list
     provenance: dict
     warnings: dict

@@ -60,7 +60,7 @@ def cost_row(results, items, spp):
 def formula_bytes(results, item):
     """What a method's formula says about its memory; None without one."""
     method, scene = results.settings.method(item.method), results.settings.scene(item.scene)
-    return method.memory and round(method.memory.structure_bytes(scene.texels, item.bins))
+    return method.memory and round(method.memory.structure_bytes(scene.texels, item.bins, item.refinement))
 
 
 def error_text(crops, metric):

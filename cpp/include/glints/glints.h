@@ -140,6 +140,7 @@ struct Statistics {
     uint64_t structure_bytes;               ///< memory that `evaluate`, `pdf` and `sample` need
     double build_seconds;                   ///< wall time of the construction, without reading the file
     uint32_t bins;                          ///< bins per side; 0 for methods without bins
+    uint32_t refinement;                    ///< elements per texel and side; 0 for methods without elements
     float masking_alpha_u, masking_alpha_v; ///< roughness of G_x along u and v; 0 without masking
 };
 

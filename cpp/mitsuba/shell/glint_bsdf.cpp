@@ -118,6 +118,7 @@ public:
             << m_reflectance.to_string() << ",\n"
             << "  masking_alpha = [" << s.masking_alpha_u << ", " << s.masking_alpha_v << "],\n"
             << "  bins = " << s.bins << ",\n"
+            << "  refinement = " << s.refinement << ",\n"
             << "  structure_bytes = " << s.structure_bytes << ",\n"
             << "  build_seconds = " << s.build_seconds << "\n"
             << "]";

@@ -92,6 +92,7 @@ mod ffi {
         structure_bytes: u64,
         build_seconds: f64,
         bins: u32,
+        refinement: u32,
         masking_alpha_u: f32,
         masking_alpha_v: f32,
     }
@@ -314,6 +315,7 @@ impl Brdf {
             structure_bytes: method.structure_bytes() as u64,
             build_seconds: self.build_seconds,
             bins: method.bins().unwrap_or(0),
+            refinement: method.refinement().unwrap_or(0),
             masking_alpha_u,
             masking_alpha_v,
         }

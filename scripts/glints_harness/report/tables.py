@@ -130,14 +130,15 @@ def printed_text(scene, method, quantity):
 
 def table_4(results):
     """Bins and memory by flake roughness, at the paper's roughnesses and at those that were rendered."""
-    measured = {}
+    measured = {key: (item["bins"], item["structure_bytes"]) for key, item in results.table_4.items()}
     for scene in results.settings.scenes:
         found = structures(results, scene)
         for method in results.settings.methods:
             if method.name in found and found[method.name].bins is not None:
-                measured[scene.name, method.parameters.get("alpha", scene.alpha)] = found[method.name]
+                item = found[method.name]
+                measured[scene.name, method.parameters.get("alpha", scene.alpha)] = item.bins, item.structure_bytes
     alphas = sorted({*paper.TABLE_4, *(alpha for _, alpha in measured)})
-    bins = {alpha: item.bins for (_, alpha), item in measured.items()}
+    bins = {alpha: count for (_, alpha), (count, _) in measured.items()}
     rows = [["bin resolution b²", *(bins_cell(bins.get(alpha), alpha) for alpha in alphas)]]
     for scene in results.settings.scenes:
         name = scene.name
@@ -152,12 +153,12 @@ def bins_cell(bins, alpha):
     return Cell("–" if bins is None else f"{bins}²", printed)
 
 
-def memory_cell(item, scene, alpha):
-    """Memory, measured and printed."""
+def memory_cell(measured, scene, alpha):
+    """Memory, measured and printed; `measured` is a pair of bins and bytes, or None."""
     printed = ""
     if alpha in paper.TABLE_4 and scene in ("shoes", "kettle"):
         printed = f"paper {paper.TABLE_4[alpha][1 if scene == 'shoes' else 2]} MB"
-    return Cell("–" if item is None else bytes_text(item.structure_bytes), printed)
+    return Cell("–" if measured is None else bytes_text(measured[1]), printed)
 
 
 # ---- errors ----------------------------------------------------------------------------------------------------------

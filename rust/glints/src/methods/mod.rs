@@ -49,6 +49,11 @@ pub trait Method: Send + Sync {
         None
     }
 
+    /// Elements per texel and side, for the methods that have elements.
+    fn refinement(&self) -> Option<u32> {
+        None
+    }
+
     /// The name under which people ask for the method.
     fn name(&self) -> &'static str;
 }

@@ -292,6 +292,13 @@ impl Method for Yan16 {
         self.tree.bytes()
     }
 
+    fn refinement(&self) -> Option<u32> {
+        Some(match self.options.elements {
+            Elements::Flat => 1,
+            Elements::Curved { refinement } => refinement,
+        })
+    }
+
     fn name(&self) -> &'static str {
         match self.options.elements {
             Elements::Flat => "yan16 flat",
