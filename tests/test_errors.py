@@ -147,8 +147,9 @@ def test_structure_parameters_belong_to_one_plugin(rough_map, plugin, name):
     "parameters, fragments",
     [
         ({"alpha": 0.1, "intrinsic": 0.1}, ["alpha", "intrinsic", "exclude"]),
-        ({"intrinsic": 0.0}, ["intrinsic", "alpha / sqrt(2)"]),
-        ({"intrinsic": 1.0}, ["intrinsic", "0.707"]),
+        ({"intrinsic": 0.0}, ["intrinsic", "0.7071"]),
+        ({"alpha": 5e-5}, ["alpha", "0.0001"]),
+        ({"intrinsic": 1.0}, ["intrinsic", "0.7071"]),
         ({"elements": "round"}, ["elements", "flat", "curved"]),
         ({"refinement": 2}, ["refinement"]),
         ({"elements": "curved", "refinement": 17}, ["refinement", "1 to 16"]),

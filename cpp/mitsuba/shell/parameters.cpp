@@ -105,7 +105,11 @@ float roughness_parameter(const Properties &props, const char *other, float fact
         return fallback;
     if (props.has_property("alpha"))
         refuse_conflict(props, "alpha", other, "both set the roughness of a flake");
-    return factor * props.get<float>(other);
+    float value = props.get<float>(other);
+    if (!(factor * value >= 1e-4f && factor * value <= 1.f))
+        Throw("%s: parameter \"%s\" is %s; it must be in [%s, %s].", props.plugin_name(), other, value, 1e-4f / factor,
+              1.f / factor);
+    return factor * value;
 }
 
 Parameters::Parameters(const Properties &props) : plugin(props.plugin_name()) {

@@ -211,6 +211,7 @@ fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result
                     .into(),
             });
         }
+        flakes(surface)?;
         let elements = match (options.curved, options.refinement) {
             (false, _) => Elements::Flat,
             (true, 0) => Elements::Curved {

@@ -55,6 +55,25 @@ impl Symmetric {
         }
     }
 
+    /// Least `k^T M k` over integer vectors k other than zero, of a positive definite M: reduction of binary
+    /// quadratic forms (Gauss 1801, Article 171).
+    pub fn shortest(&self) -> f64 {
+        let (mut a, mut b, mut c) = (self.xx, self.xy, self.yy);
+        // Each round but the last at least halves c; rounding must not keep it going.
+        for _ in 0..128 {
+            if a > c {
+                (a, c) = (c, a);
+            }
+            let m = (b / a).round();
+            if m == 0.0 {
+                break;
+            }
+            c += m * (m * a - 2.0 * b);
+            b -= m * a;
+        }
+        a.min(c)
+    }
+
     /// `v^T M v`.
     pub fn form(&self, v: DVec2) -> f64 {
         self.xx * v.x * v.x + 2.0 * self.xy * v.x * v.y + self.yy * v.y * v.y
@@ -97,13 +116,18 @@ impl GaussianFootprint {
     }
 
     /// Whether the Gaussian, convolved as in [`Self::covariance`] and summed over the repetitions of the map,
-    /// is constant: its Fourier coefficients `exp(-2 pi^2 k^T Q k)`, with Q in periods, say so.
+    /// is constant: its Fourier coefficients `2 exp(-2 pi^2 k^T Q k)`, with Q in periods, say so. The largest
+    /// belongs to the shortest wave vector k; along a thin footprint that closes on itself it is a long one.
     pub fn reach(&self, blur: f64) -> Reach {
         let q = self.covariance(blur);
-        let even =
-            |k: DVec2| 2.0 * (-2.0 * std::f64::consts::PI.powi(2) * q.form(k / self.size)).exp() < EVEN;
-        let waves = [DVec2::X, DVec2::Y, DVec2::ONE, DVec2::new(1.0, -1.0)];
-        if waves.into_iter().all(even) {
+        let size = self.size;
+        let in_periods = Symmetric {
+            xx: q.xx / (size.x * size.x),
+            xy: q.xy / (size.x * size.y),
+            yy: q.yy / (size.y * size.y),
+        };
+        let largest = 2.0 * (-2.0 * std::f64::consts::PI.powi(2) * in_periods.shortest()).exp();
+        if largest < EVEN {
             Reach::Whole
         } else {
             Reach::Local
@@ -206,6 +230,35 @@ mod tests {
             });
             prop_assert_eq!(found, 1);
         }
+    }
+
+    proptest! {
+        #[test]
+        fn the_shortest_wave_is_found(
+            length in 0.05..3.0, ratio in 0.02..1.0, turn in 0.0..std::f64::consts::PI,
+        ) {
+            let a: DVec2 = DVec2::from_angle(turn) * length;
+            let b: DVec2 = a.perp() * ratio;
+            let m = Symmetric {
+                xx: a.x * a.x + b.x * b.x,
+                xy: a.x * a.y + b.x * b.y,
+                yy: a.y * a.y + b.y * b.y,
+            };
+            let naive = (-60..=60)
+                .flat_map(|x| (-60..=60).map(move |y| DVec2::new(f64::from(x), f64::from(y))))
+                .filter(|k| *k != DVec2::ZERO)
+                .map(|k| m.form(k))
+                .fold(f64::INFINITY, f64::min);
+            prop_assert!((m.shortest() - naive).abs() <= 1e-9 * naive, "{} {naive}", m.shortest());
+        }
+    }
+
+    #[test]
+    fn a_thin_footprint_that_closes_on_itself_does_not_cover_the_map() {
+        // Three periods along (1, 2): a closed line on the torus, which most waves cancel on.
+        let a = DVec2::new(1.0, 2.0).normalize() * 3.0 * 2048.0;
+        let footprint = Footprint::in_texels(2048, 2048, DVec2::splat(20.0), a, a.perp() / 300.0);
+        assert_eq!(GaussianFootprint::new(&footprint, 0.5).reach(0.2), Reach::Local);
     }
 
     #[test]

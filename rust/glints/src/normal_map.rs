@@ -2,8 +2,9 @@
 //!
 //! A map is `width * height` unit normals in the local shading frame (x along u, y along v, z up), row by
 //! row, row 0 at v = 0. The texel with column `i` and row `j` covers `[i, i+1) x [j, j+1)` of texel space,
-//! and the map repeats in both directions. Interpolation is never applied: the surface is piecewise flat, one
-//! mirror (or rough flake) per texel, as in Atanasov et al. 2021, Section 3.2.
+//! and the map repeats in both directions. The surface is piecewise flat, one mirror (or rough flake) per
+//! texel, as in Atanasov et al. 2021, Section 3.2; methods for smooth surfaces ask for
+//! [`NormalMap::interpolated`] normals.
 //!
 //! Validation happens here, once: components are finite, lengths are not zero, and every normal points out of
 //! the surface (`z >= MIN_Z`). Methods rely on it and check nothing again.

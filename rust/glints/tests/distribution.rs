@@ -235,21 +235,41 @@ fn samples_have_their_density() {
     }
 }
 
+/// A point, less than a texel, some texels, several repetitions of the map, an even cover of it, and thin
+/// ones: many periods, a line, a closed line on the repeated map.
+fn footprints_of_all_kinds() -> Vec<Footprint> {
+    let mut all: Vec<Footprint> = [0.0, 0.5, 9.0, 70.0, 300.0]
+        .map(|width| footprint(64, width))
+        .into();
+    let slope = DVec2::new(1.0, 2.0).normalize();
+    for (a, thickness) in [
+        (DVec2::from_angle(0.3) * 900.0, 2.0),
+        (DVec2::from_angle(1.1) * 40.0, 0.0),
+        (slope * 300.0, 1.0),
+    ] {
+        let b = a.normalize().perp() * thickness;
+        all.push(Footprint::in_texels(64, 64, DVec2::new(20.7, 41.2), a, b));
+    }
+    all
+}
+
 #[test]
 fn samples_of_position_normal_mixtures_have_their_density() {
     let map = wavy_map(64);
     let refined = Elements::Curved { refinement: 2 };
     for elements in [Elements::Flat, Elements::Curved { refinement: 1 }, refined] {
         let method = yan16(&map, 0.05, elements);
-        // A point, less than a texel, some texels, several repetitions of the map, an even cover of it.
-        for width in [0.0, 0.5, 9.0, 70.0, 300.0] {
-            let footprint = footprint(64, width);
+        for (kind, footprint) in footprints_of_all_kinds().iter().enumerate() {
             let grid = || (48, [0..48, 0..48]);
-            let exact = chi_square(&method, |h| method.density(&footprint, h), &footprint, grid(), 5);
-            assert!(is_plausible(exact), "{} width {width}: {exact:?}", method.name());
-            if width == 9.0 {
+            let exact = chi_square(&method, |h| method.density(footprint, h), footprint, grid(), 5);
+            assert!(
+                is_plausible(exact),
+                "{} footprint {kind}: {exact:?}",
+                method.name()
+            );
+            if kind == 2 {
                 // Without the cosine it is another density.
-                let twin = chi_square(&method, |h| method.ndf(&footprint, h), &footprint, grid(), 5);
+                let twin = chi_square(&method, |h| method.ndf(footprint, h), footprint, grid(), 5);
                 assert!(!is_plausible(twin), "{}: {twin:?}", method.name());
             }
         }
@@ -259,20 +279,19 @@ fn samples_of_position_normal_mixtures_have_their_density() {
 #[test]
 fn position_normal_mixtures_are_normalized() {
     let map = wavy_map(64);
-    for elements in [
-        Elements::Flat,
-        Elements::Curved { refinement: 1 },
-        Elements::Curved { refinement: 3 },
-    ] {
+    for refinement in 0..4 {
+        let elements = match refinement {
+            0 => Elements::Flat,
+            refinement => Elements::Curved { refinement },
+        };
         let method = yan16(&map, 0.05, elements);
-        for width in [0.0, 0.5, 9.0, 70.0, 300.0] {
+        for (kind, footprint) in footprints_of_all_kinds().iter().enumerate() {
             let (points, cell) = disk(160);
-            let footprint = footprint(64, width);
-            let integral: f64 = points.map(|h| f64::from(method.ndf(&footprint, h))).sum::<f64>() * cell;
+            let integral: f64 = points.map(|h| f64::from(method.ndf(footprint, h))).sum::<f64>() * cell;
+            let name = method.name();
             assert!(
                 (integral - 1.0).abs() < 0.005,
-                "{} width {width}: {integral}",
-                method.name()
+                "{name} footprint {kind}: {integral}"
             );
         }
     }

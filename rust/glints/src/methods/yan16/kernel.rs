@@ -16,10 +16,11 @@ pub struct Kernel {
     pub q: Symmetric,
     /// H in texels.
     spacing: f32,
-    /// `Q^-1`; zero if the whole map is covered evenly.
-    inverse: [f32; 3],
-    /// `sigma_h^2 Q^-1`.
-    pull: [f32; 3],
+    /// W, upper triangular, with `W^T W = Q^-1`; zero if the whole map is covered evenly. A form in Q^-1
+    /// itself would lose thin footprints to cancellation.
+    whitening: [f32; 3],
+    /// `sigma_h^2`.
+    blur: f32,
     /// L, what the footprint leaves of a seed's variance.
     rest: [f32; 3],
     variance: f32,
@@ -39,11 +40,11 @@ impl Kernel {
         let reach = gaussian.reach(blur);
         let q = gaussian.covariance(blur);
         let t = f64::from(LARGEST_EXPONENT);
-        let (inverse, weight, tail) = match reach {
+        let (inverse, whitening, weight, tail) = match reach {
             Reach::Local => {
                 let peak = spacing * spacing / (TAU * q.determinant().sqrt());
                 let sum = lattice_sum(&q, gaussian.center(), spacing);
-                (q.inverse(), peak / sum, (-t).exp() * (1.0 + t))
+                (q.inverse(), whitening(&q), peak / sum, (-t).exp() * (1.0 + t))
             }
             Reach::Whole => {
                 let size = gaussian.map_size();
@@ -52,15 +53,15 @@ impl Kernel {
                     xy: 0.0,
                     yy: 0.0,
                 };
-                (none, spacing * spacing / (size.x * size.y), (-t).exp())
+                (none, [0.0; 3], spacing * spacing / (size.x * size.y), (-t).exp())
             }
         };
         let packed = |m: &Symmetric, factor: f64, diagonal: f64| {
             [diagonal + factor * m.xx, factor * m.xy, diagonal + factor * m.yy].map(|x| x as f32)
         };
         Self {
-            inverse: packed(&inverse, 1.0, 0.0),
-            pull: packed(&inverse, blur, 0.0),
+            whitening,
+            blur: blur as f32,
             rest: packed(&inverse, -blur * blur, blur),
             variance: variance as f32,
             inv_variance: (1.0 / variance) as f32,
@@ -88,8 +89,8 @@ impl Kernel {
         for ((&x, &y), &place) in leaf.x.iter().zip(leaf.y).zip(leaf.places) {
             let delta = s - Vec2::new(x, y);
             let offset = self.offset(corner, place);
-            let exponent = 0.5 * (form(&self.inverse, offset) + delta.length_squared() * self.inv_variance);
-            sum += share(exponent);
+            let place = self.whitened(offset).length_squared();
+            sum += share(0.5 * (place + delta.length_squared() * self.inv_variance));
         }
         sum
     }
@@ -122,12 +123,22 @@ impl Kernel {
         corner + (Vec2::new(x, y) + 0.5) * self.spacing
     }
 
+    /// `W d`.
+    #[inline]
+    fn whitened(&self, d: Vec2) -> Vec2 {
+        let [wx, wxy, wy] = self.whitening;
+        Vec2::new(wx * d.x + wxy * d.y, wy * d.y)
+    }
+
     /// Exponent of the share of an element at `offset` from the centre, at a distance `delta` from its normal;
     /// and the height of its lobe relative to a flat one's.
     #[inline]
     pub fn exponent(&self, offset: Vec2, delta: Vec2, jacobian: &[f32; 4]) -> (f32, f32) {
         let [xu, xv, yu, yv] = *jacobian;
-        let d = delta + apply(jacobian, multiply(&self.pull, offset));
+        let white = self.whitened(offset);
+        let [wx, wxy, wy] = self.whitening;
+        let pull = self.blur * Vec2::new(wx * white.x, wxy * white.x + wy * white.y);
+        let d = delta + apply(jacobian, pull);
         let (x, y) = (Vec2::new(xu, xv), Vec2::new(yu, yv));
         let (rest_x, rest_y) = (multiply(&self.rest, x), multiply(&self.rest, y));
         let (xx, xy, yy) = (
@@ -137,7 +148,7 @@ impl Kernel {
         );
         let inv_determinant = 1.0 / (xx * yy - xy * xy);
         let distance = (yy * d.x * d.x - 2.0 * xy * d.x * d.y + xx * d.y * d.y) * inv_determinant;
-        let exponent = 0.5 * (form(&self.inverse, offset) + distance);
+        let exponent = 0.5 * (white.length_squared() + distance);
         (exponent, self.variance * inv_determinant.sqrt())
     }
 }
@@ -152,9 +163,10 @@ fn share(exponent: f32) -> f32 {
     }
 }
 
-#[inline]
-fn form(m: &[f32; 3], v: Vec2) -> f32 {
-    m[0] * v.x * v.x + 2.0 * m[1] * v.x * v.y + m[2] * v.y * v.y
+/// W of [`Kernel`]: along y, and along x what is left of the regression on y.
+fn whitening(q: &Symmetric) -> [f32; 3] {
+    let wx = (q.yy / q.determinant()).sqrt();
+    [wx, -wx * q.xy / q.yy, 1.0 / q.yy.sqrt()].map(|x| x as f32)
 }
 
 #[inline]

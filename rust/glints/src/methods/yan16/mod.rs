@@ -149,9 +149,9 @@ impl Options {
         }
         if let Elements::Curved { refinement } = elements {
             let texels = u64::from(map.width()) * u64::from(map.height());
-            let fits = refinement <= 16 && texels * u64::from(refinement).pow(2) <= u64::from(u32::MAX);
+            let fits = refinement <= 16 && texels * u64::from(refinement).pow(2) <= 1 << 30;
             if refinement == 0 || !fits {
-                let reason = "must be 1 to 16 elements a texel and side, and 2^32 in all at most";
+                let reason = "must be 1 to 16 elements a texel and side, and 2^30 in all at most (32 GB)";
                 return Err(Error::parameter("refinement", refinement, reason));
             }
         }
