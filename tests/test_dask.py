@@ -56,7 +56,11 @@ def test_a_killed_worker_loses_nothing(mini, cluster, tmp_path, monkeypatch):
     local = Comparison(settings(mini, tmp_path / "local"), executors.Local(), Silent(), {})
     local.render()
     chosen = settings(mini, tmp_path / "dask")
-    place = executors.Dask(cluster.scheduler_address, {mini.name: mini.text(METHODS["normalmap"], 1)}, {})
+    warnings = {}
+    place = executors.Dask(cluster.scheduler_address, {mini.name: mini.text(METHODS["normalmap"], 1)}, warnings)
+    assert [(count, "seconds are those of a shared machine" in text) for text, count in warnings.items()] == [
+        (2, True)
+    ]
     distributed = Comparison(chosen, place, Silent(), {})
     kept, killed = [], []
     receive = distributed.receive
@@ -83,7 +87,7 @@ def test_a_killed_worker_loses_nothing(mini, cluster, tmp_path, monkeypatch):
 
     # The same cache: without the cluster, nothing is left to do.
     again = Comparison(chosen, executors.Local(), Silent(), {})
-    assert again.reference_jobs() == [] and again.render_jobs() == []
+    assert again.reference_jobs() == [] and again.missing_runs() == []
 
 
 def test_workers_that_differ_are_refused(mini, monkeypatch):
@@ -105,5 +109,21 @@ def test_a_cluster_without_workers_and_none_at_all_are_named():
 
 def test_a_worker_with_other_plugins_renders_nothing():
     job = jobs.RenderJob("job", "<scene version='3.0.0'/>", ())
+    expected = {"plugins": provenance.plugin_digest(), "machine": executors.kind(provenance.machine())}
     with pytest.raises(RuntimeError, match="this worker's plugins have the digest"):
-        executors.work(job, "another")
+        executors.work(job, {**expected, "plugins": "another"})
+    with pytest.raises(RuntimeError, match="this worker's machine is .*, not .'another', 1"):
+        executors.work(job, {**expected, "machine": ("another", 1)})
+
+
+def test_references_travel_once(mini, tmp_path, monkeypatch):
+    """However often they are handed over on the way."""
+    monkeypatch.setattr(jobs, "SNAPSHOT_SECONDS", 0.0)
+    (job, *_) = Comparison(settings(mini, tmp_path), executors.Local(), Silent(), {}).reference_jobs()
+    expected = {"plugins": provenance.plugin_digest(), "machine": executors.kind(provenance.machine())}
+    with monkeypatch.context() as patch:
+        patch.setattr(render, "collect_warnings", dict)
+        patch.setattr(executors, "_warnings", None)
+        outcomes, _ = executors.work(job, expected)
+    assert [item.key for item in outcomes] == [item.key for item in job.wanted]
+    assert all(item.reference.enough(0, 64) for item in outcomes)

@@ -5,6 +5,7 @@ import csv
 import json
 import math
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as xml
@@ -12,9 +13,11 @@ from xml.etree import ElementTree as xml
 import numpy as np
 import pytest
 import support
+import test_report
 from glints_harness import bench, cli, compare, executors, files, images, maps, metrics, plan, render, scenes
 from glints_harness.methods import GLINTS, METHODS, check_plugins, choose
 from glints_harness.progress import Silent
+from glints_harness.report import text
 from glints_harness.summary import METRICS
 from mini import SCRIPTS, no_assets, run_compare
 
@@ -195,12 +198,21 @@ def test_results_list_every_run(comparison):
     ]
     assert sequence == [(*curve, frame) for curve in texels for frame in range(3)]
     sweep = {(item["method"], item["footprint"], item["tiling"]) for item in results["sweep"]}
-    assert sweep == {(*curve, tiling) for curve in texels for tiling in (2, 4)}
+    assert sweep == {(*curve, tiling) for curve in curves() for tiling in (2, 4)}
+    unmeasured = {item["method"] for item in results["sweep"] if not item["errors"]}
+    assert unmeasured == {name for name, method in METHODS.items() if method.surface != "texels"}
     for record in records:
         assert record["seconds"] > 0 and record["cpu_seconds"] > 0 and record["nonfinite"] == 0
         assert (out / record["image"]).is_file()
         assert results["provenances"][record["provenance"]]["plugins"] == results["provenance"]["plugins"]
-        if record["view"] != "frame" and record["frame"] is None:
+        method = METHODS[record["method"]]
+        assert record["alpha"] == (0.05 if record["method"] == "glints_ibm_rough" else 0.1)
+        assert record["parameters"] == method.parameters
+        if (
+            record["view"] != "frame"
+            and record["frame"] is None
+            and (record["tiling"] == 2 or method.surface == "texels")
+        ):
             assert all(math.isfinite(record[name]) for name in METRICS)
     sizes = {record["method"]: record["structure_bytes"] for record in records}
     assert sizes["glints_ibm"] > 0 and sizes["normalmap"] is None
@@ -208,6 +220,7 @@ def test_results_list_every_run(comparison):
         table = list(csv.DictReader(file))
     assert [row["image"] for row in table] == [record["image"] for record in records]
     assert float(table[0]["rmse"]) == records[0]["rmse"]
+    assert all(json.loads(row["parameters"]) == METHODS[row["method"]].parameters for row in table)
 
 
 def test_an_image_on_disk_gives_the_listed_errors(comparison):
@@ -251,6 +264,23 @@ def test_the_report_shows_every_method(comparison):
     page = (out / "index.html").read_text(encoding="utf-8")
     assert all(method.label in page for method in METHODS.values())
     assert not [name for name in out.rglob(".unfinished-*")]
+
+
+def test_the_report_of_a_comparison_opens_without_complaint(comparison):
+    """In a browser; its mean errors are shares of the references' means."""
+    out, _, results = comparison
+    with test_report.launched() as browser, test_report.opened(browser, out / "index.html", 1000, 700) as page:
+        headings = page.locator("[data-metric=mean_error] th").all_text_contents()
+        column = headings.index("of the mean") % len(set(headings))
+        shown = [
+            row.locator("td").nth(column).text_content()
+            for row in page.locator("[data-metric=mean_error] tbody tr").all()
+        ]
+    assert len(shown) == len([item for item in results["summaries"] if item["errors"]])
+    assert all(re.fullmatch(r"[+−]\d+\.\d %", share) for share in shown), shown
+    first = next(item for item in results["summaries"] if (item["view"], item["spp"]) == ("crop1", 1))
+    mean = images.read_exr(out / "runs" / "mini-x2" / "crop1" / "reference-texels.exr").mean()
+    assert shown[0] == text.percent(first["errors"]["mean_error"]["total"]["value"] / mean)
 
 
 def test_a_second_comparison_reuses_what_is_kept(comparison, mini_folder, tmp_path):

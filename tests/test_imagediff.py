@@ -303,6 +303,22 @@ def test_bad_input_is_answered(command, tmp_path):
         assert status == 2 and fragment in err, (arguments, err)
 
 
+def test_whatever_goes_wrong_is_no_difference(command, tmp_path, monkeypatch):
+    """An exit status of 1 says that images differ."""
+    image = write(tmp_path / "one.exr", glints(1).values[0])
+    broken = mi.Bitmap(glints(1).values[0])
+    broken.metadata()[storage.ATTRIBUTE] = '{"seeds": 8,'
+    broken.write(str(tmp_path / "broken.exr"))
+    status, _, err = command(image, tmp_path / "broken.exr")
+    assert status == 2 and "broken.exr is a stored reference with a broken header" in err
+
+    def fail(*_):
+        raise ZeroDivisionError("no reason")
+
+    monkeypatch.setattr(statistic, "compare_exactly", fail)
+    assert command(image, image)[0::2] == (2, "imagediff: unexpected ZeroDivisionError: no reason\n")
+
+
 def test_references_of_other_scales_are_refused():
     with pytest.raises(BadInput, match="constants"):
         compare(glints(4).moments(1.0), glints(4).moments(2.0))

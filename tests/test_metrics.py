@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from glints_harness import images, metrics, reference, render, scenes, temporal
-from glints_harness.summary import METRICS
+from glints_harness.summary import METRICS, ErrorSplit, Estimate
 
 SEEDS = 8
 
@@ -94,6 +94,16 @@ def test_batches_give_mean_and_standard_error():
         kept.add(render.Rendering(batch, 1.0, 1.0))
     np.testing.assert_allclose(kept.mean, batches.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(kept.standard_error, batches.std(axis=0, ddof=1) / math.sqrt(5), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("metric", "total"), [("rmse", 1.4), ("relmse", 1.9), ("smape", 1.4), ("flip", 1.4), ("mean_error", -1.9)]
+)
+def test_what_counts_as_the_references_noise(metric, total):
+    """Of a noise of 1: half of the squared error, and so on; 20 % more is the method's own."""
+    for factor, expected in ((1.0, True), (1.2, False), (math.inf, False), (math.nan, False)):
+        value = Estimate(factor * total, 0.0, 0.0)
+        assert ErrorSplit(value, None, None, 1.0).at_noise(metric) == expected
 
 
 def test_the_split_adds_up(no_flip):

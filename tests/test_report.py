@@ -15,8 +15,8 @@ import pytest
 from glints_harness import images, metrics, plan
 from glints_harness.methods import METHODS
 from glints_harness.reference import Reference
+from glints_harness.report import animation, pictures, plots, tables, text
 from glints_harness.report import page as report_page
-from glints_harness.report import pictures, plots, tables, text
 from glints_harness.scenes import View
 from glints_harness.summary import METRICS, ErrorSplit, Estimate, Results, Summary, TemporalResult
 from PIL import Image
@@ -73,7 +73,7 @@ class Builder:
             "time_budget": None,
             "budget_includes_build": False,
             "frame": None,
-            "runs": ({"mean_reference": 0.4},) * 2,
+            "runs": ({},) * 2,
             "errors": errors(rank / math.sqrt(spp), method),
             "top_percent_share": 0.4,
             "seconds": Estimate(0.01 * spp * rank, 0.009 * spp * rank, 0.012 * spp * rank),
@@ -84,7 +84,6 @@ class Builder:
             "bins": 333 if method.startswith("glints_ibm") else None,
             "refinement": 1 if "yan16" in method else None,
             "nonfinite": 0,
-            "at_reference_noise": rank == 1,
             "image": self.exr(name, FRAME_SIDE if view == "frame" else SIDE, method == "normalmap"),
             "mean_image": self.exr(f"{name}-mean", FRAME_SIDE if view == "frame" else SIDE),
         }
@@ -95,7 +94,10 @@ class Builder:
         names = tuple(self.exr(f"sequence/{method}-{frame}") for frame in range(FRAMES))
         excess = Estimate(0.5, 0.4, 0.7)
         footprint = "none" if method == "reference" else "sample"
-        return TemporalResult("shoes", 8, method, footprint, 1, FRAMES, 0.9, excess, (30.0, 20.0, 25.0, 40.0), names)
+        excess_image = None if method == "reference" else self.exr(f"sequence/{method}-excess")
+        return TemporalResult(
+            "shoes", 8, method, footprint, 1, FRAMES, 0.9, excess, (30.0, 20.0, 25.0, 40.0), names, excess_image
+        )
 
 
 def errors(size, method):
@@ -231,6 +233,43 @@ def test_tables_2_to_4_show_ours_beside_the_papers(written):
     ]
 
 
+def test_errors_at_the_references_noise_are_marked_one_by_one(written):
+    """Those of the best method at 16 spp: 0.25 each, of a noise of 0.05 each, but for the relative MSE's and FLIP's."""
+    results, _ = written
+    item = next(s for s in results.summaries if (s.method, s.view, s.spp) == ("glints_ibm", "crop1", 16))
+    noises = {"relmse": 0.13, "flip": 0.17}
+    split = {name: dataclasses.replace(item.errors[name], noise=noise) for name, noise in noises.items()}
+    noisy = dataclasses.replace(item, errors={**item.errors, **split})
+    marked = {name for name in METRICS if "≈" in tables.error_table(results, [noisy], name).rows[0][5].text}
+    assert marked == {"relmse", "flip"}
+
+
+def test_mean_errors_are_shares_of_the_references_mean(written):
+    results, _ = written
+    item = next(s for s in results.summaries if (s.method, s.view) == ("glints_ibm_rough", "crop1"))
+    mean = results.references["shoes", item.tiling, "rough", "crop1"].mean.mean()
+    (row,) = tables.error_table(results, [item], "mean_error").rows
+    assert row[6].text == text.percent(-0.01 / mean)
+
+
+def test_what_was_left_out_everywhere_is_not_called_not_compared(written):
+    """A method without a single picture of a view."""
+    results, _ = written
+    shown = [s for s in results.summaries if s.method != LEFT_OUT[0]]
+    gallery = pictures.gallery(dataclasses.replace(results, summaries=shown), SimpleNamespace(submit=lambda *_: None))
+    group = gallery.cases[1]["views"][1]["groups"][0]
+    details = {entry["name"]: entry["detail"] for entry in report_page.strip(gallery, group)}
+    assert details["Yan (curved)"] == "left out"
+
+
+def test_excess_variance_is_shown_by_sign():
+    values = np.array([[-4.0, 0.0, 4.0, 100.0, np.nan]])
+    found = animation.signed_colours(animation.signed_root(np.stack([values] * 3, axis=-1)), 2.0)[0].astype(int)
+    assert found[0, 2] > found[0, 0] + 50 and found[2, 0] > found[2, 2] + 50
+    assert np.ptp(found[1]) < 5 and tuple(found[2]) == tuple(found[3])
+    assert tuple(found[4]) == images.INVALID_COLOUR
+
+
 def test_every_plot_is_there_as_svg_and_pdf(written):
     results, _ = written
     names = {path.stem for path in (results.out / "plots").glob("*.svg")}
@@ -265,17 +304,24 @@ def test_the_animation_has_every_frame(written):
 # ---- the page in a browser -------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def browser():
+@contextlib.contextmanager
+def launched():
     """A headless Chromium, if this machine has one."""
     sync_api = pytest.importorskip("playwright.sync_api")
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if program is None:
         pytest.skip("no Chromium on this machine: the report was not opened in a browser")
     with sync_api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
-        yield launched
-        launched.close()
+        chromium = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """One browser for all of these tests."""
+    with launched() as chromium:
+        yield chromium
 
 
 @contextlib.contextmanager

@@ -19,8 +19,8 @@ from .scenes import find_scenes
 
 ROOT = Path(__file__).resolve().parents[2]
 
-DEFAULT_SPPS = (1, 4, 16)
-DEFAULT_TIMES = (0.2,)
+DEFAULT_SPPS = (1, 4)
+DEFAULT_TIMES = (0.15,)
 DEFAULT_LIMIT = 430.0
 """Seconds; see `Settings.limit`. Keeps the default comparison under eight minutes, the report included."""
 
@@ -60,12 +60,13 @@ def parser():
         help="rules for methods that filter, with commas (default: sample, and also pixel for glints_ibm)",
     )
     size = result.add_argument_group("how much").add_argument
-    size("--spp", type=numbers(int), help="samples per pixel of the crops (default: 1,4,16)")
+    size("--spp", type=numbers(int), help="samples per pixel of the crops (default: 1,4)")
     size(
         "--time",
         type=numbers(float),
         default=(),
-        help="equal-time budgets in seconds a crop, rendering alone (default: 0.2)",
+        help=f"equal-time budgets in seconds a crop, rendering alone (default: {DEFAULT_TIMES[0]:g}; none with --spp, "
+        "--time-with-build or --dask)",
     )
     size(
         "--time-with-build",

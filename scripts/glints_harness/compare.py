@@ -41,9 +41,12 @@ class Comparison:
         """`ReferenceKey` to `Reference`."""
         self.records = {}
         """`Run` to record, flat."""
+        self.alphas = {scene.name: scene.alpha for scene in settings.scenes}
+        """Flake roughness of each scene's slot."""
         self.provenances = {}
         """What records name by a digest."""
         self.left_out = []
+        """`LeftOut`s."""
         self.image_seconds = measure.image_seconds(settings, executor.machine["cores"])
         self.start = time.perf_counter()
 
@@ -67,7 +70,7 @@ class Comparison:
             sweep=measure.of_points(found, self.plan.sweep),
             temporal=temporal.results(self),
             table_4=structures.of_table_4(self.settings),
-            left_out=self.left_out,
+            left_out=[item.record() for item in self.left_out],
             provenance=provenance.provenance(),
             warnings=self.warnings,
             exposure=0.0,
@@ -79,7 +82,7 @@ class Comparison:
 
     def render(self):
         """Render what is missing; afterwards `records`, `references` and `left_out` are complete."""
-        reference_jobs, render_jobs = self.reference_jobs(), self.render_jobs()
+        reference_jobs, render_jobs = self.reference_jobs(), self.render_jobs(self.missing_runs())
         expected = sum(job.expected_seconds for job in (*reference_jobs, *render_jobs))
         self.progress.expect(expected + self.image_seconds * len(self.plan.runs) + REPORT_SECONDS)
         self.carry_out(reference_jobs, lambda _jobs: math.inf)
@@ -89,11 +92,14 @@ class Comparison:
     def use_what_is_left(self):
         """Give the time that quick methods did not need to points that were left out, until nothing more fits."""
         before = None
-        while self.settings.limit is not None and self.left_out and len(self.left_out) != before:
-            jobs = self.render_jobs()
-            if self.time_left() < 2 * LOAD_SECONDS * len(jobs):
+        while self.settings.limit is not None:
+            left = self.time_left()
+            again = [item for item in self.left_out if not item.final and item.predicted_seconds < left]
+            points = {item.run.point for item in again}
+            jobs = self.render_jobs(run for run in self.plan.runs if run.point in points and run not in self.records)
+            if len(points) in (0, before) or left < 2 * LOAD_SECONDS * len(jobs):
                 return
-            before, self.left_out = len(self.left_out), []
+            before, self.left_out = len(points), [item for item in self.left_out if item not in again]
             self.carry_out(jobs, self.share)
 
     def carry_out(self, jobs, share):
@@ -128,8 +134,7 @@ class Comparison:
             self.store.keep(self.describe_reference(outcome.key), outcome.reference)
             self.references[outcome.key] = outcome.reference
         elif isinstance(outcome, LeftOut):
-            predicted = {"reason": outcome.reason, "predicted_seconds": outcome.predicted_seconds}
-            self.left_out.append({**outcome.run.record(), **predicted})
+            self.left_out.append(outcome)
         else:
             self.list_run(outcome.run, self.cache.keep(self.describe(outcome.run), outcome))
 
@@ -169,16 +174,23 @@ class Comparison:
 
     # ---- runs --------------------------------------------------------------------------------------------------------
 
-    def render_jobs(self):
-        """A job for each scene, tiling and method that lacks runs; finished runs come from the cache."""
-        groups = {}
+    def missing_runs(self):
+        """The runs that are not in the cache; those that are get listed."""
+        missing = []
         for run in self.plan.runs:
             kept = self.recover(self.cache.find, self.describe(run))
             if kept is None:
-                groups.setdefault((run.scene, run.tiling, run.method), []).append(run)
+                missing.append(run)
             else:
                 self.list_run(run, kept)
-        return [self.render_job(*case, runs) for case, runs in groups.items()]
+        return missing
+
+    def render_jobs(self, runs):
+        """A job for each scene, tiling and method of these runs."""
+        groups = {}
+        for run in runs:
+            groups.setdefault((run.scene, run.tiling, run.method), []).append(run)
+        return [self.render_job(*case, members) for case, members in groups.items()]
 
     def render_job(self, scene, tiling, method, runs):
         """The job of one group."""
@@ -202,6 +214,8 @@ class Comparison:
             "label": method.label,
             "model": method.model,
             "surface": method.surface,
+            "alpha": method.parameters.get("alpha", self.alphas[run.scene]),
+            "parameters": dict(method.parameters),
             "nonfinite": kept["nonfinite"],
             "seconds": kept["seconds"],
             "cpu_seconds": kept["cpu_seconds"],
@@ -260,4 +274,5 @@ class Comparison:
 
 def listed(summary):
     """A summary's line in results.json: the runs by their seeds."""
-    return {**asdict(summary), "runs": [run["seed"] for run in summary.runs]}
+    noisy = [name for name in summary.errors if summary.at_reference_noise(name)]
+    return {**asdict(summary), "runs": [run["seed"] for run in summary.runs], "at_reference_noise": noisy}

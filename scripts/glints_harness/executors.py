@@ -7,8 +7,11 @@ process again, since workers may join later.
 
 import math
 import os
+import platform
+from collections import Counter
 
 from . import provenance, render
+from .jobs import Part
 from .scenes import scene_digest
 
 RETRIES = 3
@@ -83,7 +86,12 @@ class Dask:
                 f"--dask {address}: worker {crowded[0]} has {threads[crowded[0]]} threads; renderings at the same time "
                 f"in one process would share their timings; workers are to be {START_WORKERS}"
             )
-        machines = {(item["machine"]["processor"], item["machine"]["cores"]) for item in found.values()}
+        shared = sum(count for count in Counter(item["host"] for item in found.values()).values() if count > 1)
+        if shared:
+            self.warnings[
+                "Dask workers that share a machine with others: their seconds are those of a shared machine"
+            ] = shared
+        machines = {kind(item["machine"]) for item in found.values()}
         if len(machines) > 1:
             raise ValueError(
                 f"--dask {address}: the workers are different machines ({sorted(machines)}), whose seconds cannot be "
@@ -95,7 +103,7 @@ class Dask:
         """As `Local.execute`, but results come a job at a time, in any order, and no job has a time limit."""
         from distributed import as_completed
 
-        expected = provenance.plugin_digest()
+        expected = {"plugins": provenance.plugin_digest(), "machine": kind(self.machine)}
         futures = {
             self.client.submit(work, job, expected, key=f"{job.name}-{os.urandom(8).hex()}", retries=RETRIES): job
             for job in jobs
@@ -133,21 +141,43 @@ def describe(texts):
 
 
 def describe_worker(texts):
-    """`describe`, and the machine."""
-    return {**describe(texts), "machine": provenance.machine()}
+    """`describe`, the machine, and its name."""
+    return {**describe(texts), "machine": provenance.machine(), "host": platform.node()}
+
+
+def kind(machine):
+    """What of a machine has to be the same for seconds to be comparable."""
+    return machine["processor"], machine["cores"]
 
 
 _warnings = None
 
 
-def work(job, plugins):
-    """Carry out a job in a worker: its outcomes, and the warnings on the way, message to count."""
+def work(job, expected):
+    """Carry out a job in a worker: its outcomes, and the warnings on the way, message to count.
+
+    A worker that has joined since the others were checked has to have the `expected` plugins and kind of machine.
+    """
     global _warnings
     render.prepare_thread()
     if _warnings is None:
         _warnings = render.collect_warnings()
-    if provenance.plugin_digest() != plugins:
-        raise RuntimeError(f"this worker's plugins have the digest {provenance.plugin_digest()}, not {plugins}")
+    if provenance.plugin_digest() != expected["plugins"]:
+        raise RuntimeError(
+            f"this worker's plugins have the digest {provenance.plugin_digest()}, not {expected['plugins']}"
+        )
+    if kind(provenance.machine()) != expected["machine"]:
+        raise RuntimeError(
+            f"this worker's machine is {kind(provenance.machine())}, not {expected['machine']}; "
+            "seconds of different machines cannot be compared"
+        )
     _warnings.clear()
-    outcomes = list(job.carry_out(math.inf))
-    return outcomes, dict(_warnings)
+    return last_of_each(job.carry_out(math.inf)), dict(_warnings)
+
+
+def last_of_each(outcomes):
+    """The outcomes, of each reference the last `Part` alone: those before are on the way to it."""
+    kept = {}
+    for outcome in outcomes:
+        kept[outcome.key if isinstance(outcome, Part) else outcome.run] = outcome
+    return list(kept.values())

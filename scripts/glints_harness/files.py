@@ -67,13 +67,19 @@ def write_exr(path, image):
 
 
 def write_csv(path, rows):
-    """Write dictionaries as a table with a heading, whole or not at all; lists with spaces, None as nothing."""
+    """Write dictionaries as a table with a heading, whole or not at all: lists with spaces, dictionaries as JSON, None as nothing."""
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         table.writeheader()
         for row in rows:
-            flat = {key: " ".join(map(str, item)) if isinstance(item, list) else item for key, item in row.items()}
-            table.writerow(flat)
+            table.writerow({key: csv_text(item) for key, item in row.items()})
+
+
+def csv_text(value):
+    """What stands in a cell of a table."""
+    if isinstance(value, dict):
+        return json.dumps(value)
+    return " ".join(map(str, value)) if isinstance(value, list) else value
 
 
 def json_ready(value):

@@ -25,6 +25,12 @@ SAMPLE_SECONDS = 3e-6
 PILOT_SIDE = 24
 """Pixels a side of the first look at a view's cost."""
 
+TRIAL = 0.25
+"""Share of a time budget that a first rendering may fill in order to find the sample count."""
+
+PILOT_TOLERANCE, TOLERANCE = 4.0, 1.25
+"""How many times a time budget one sample per pixel may take: by the first look, which is rough, and in the end."""
+
 SNAPSHOT_SECONDS = 5.0
 """A reference is handed over this often, so that an interruption loses little."""
 
@@ -37,6 +43,12 @@ class LeftOut:
     """Of its first seed."""
     reason: str
     predicted_seconds: float
+    final: bool = False
+    """Whether it stays out however much time there is."""
+
+    def record(self):
+        """Flat, as in results.json."""
+        return {**self.run.record(), "reason": self.reason, "predicted_seconds": self.predicted_seconds}
 
 
 @dataclass
@@ -78,14 +90,19 @@ class RenderJob:
         for runs in points(self.runs):
             budget = rendering_budget(runs[0], loaded)
             if budget is not None and budget <= 0:
-                yield LeftOut(runs[0], "the time budget is shorter than building the data structure", 0.0)
+                reason = "the time budget is shorter than building the data structure"
+                yield LeftOut(runs[0], reason, loaded.structure["build_seconds"], final=True)
                 continue
             owed = len(runs) * self.image_seconds if is_measured(runs[0].view) else 0.0
-            predicted = owed + len(runs) * (stopwatch.predict(runs[0]) if budget is None else budget)
+            predicted = owed + len(runs) * (stopwatch.predict(runs[0], runs[0].spp) if budget is None else budget)
             if predicted > end - time.perf_counter():
                 yield LeftOut(runs[0], "the time limit", predicted)
                 continue
             spp = runs[0].spp if budget is None else stopwatch.fill(runs[0], budget)
+            if spp is None:
+                reason = "one sample per pixel takes longer than the time budget"
+                yield LeftOut(runs[0], reason, stopwatch.predict(runs[0], 1), final=True)
+                continue
             for run in runs:
                 yield stopwatch.finish(run, spp)
             end -= owed
@@ -113,9 +130,9 @@ class Stopwatch:
         self.loaded = loaded
         self.sample_seconds = {}
 
-    def predict(self, run):
-        """Seconds that a run of a given sample count should take."""
-        return self.speed(run) * run.view.pixels * run.spp
+    def predict(self, run, spp):
+        """Seconds that a run should take with `spp` samples per pixel."""
+        return self.speed(run) * run.view.pixels * spp
 
     def speed(self, run):
         """Seconds a sample; a view that is new is looked at first, which also warms everything up.
@@ -135,12 +152,16 @@ class Stopwatch:
         return rendering
 
     def fill(self, run, budget):
-        """Samples per pixel that fill `budget` seconds. The cost of a sample depends on their number: try, then scale."""
-        for part in (0.25, 1.0):
-            spp = max(1, int(part * budget / (self.speed(run) * run.view.pixels)))
-            if part < 1:
-                self.render(run, spp, seed=0)
-        return spp
+        """Samples per pixel that fill `budget` seconds; None if a single one takes too long.
+
+        The cost of a sample depends on their number: try, then scale.
+        """
+        if self.predict(run, 1) > PILOT_TOLERANCE * budget:
+            return None
+        self.render(run, max(1, int(TRIAL * budget / self.predict(run, 1))), seed=0)
+        if self.predict(run, 1) > TOLERANCE * budget:
+            return None
+        return max(1, int(budget / self.predict(run, 1)))
 
     def finish(self, run, spp):
         """Carry out one run."""

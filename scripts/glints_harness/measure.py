@@ -97,7 +97,7 @@ def point_of(comparison, runs):
     return Point(
         images=tuple(out / comparison.records[run]["image"] for run in runs),
         mean_image=out / "runs" / run.file_of("mean"),
-        reference=comparison.references[key] if is_measured(run.view) else None,
+        reference=comparison.references.get(key) if is_measured(run.view) else None,
     )
 
 
@@ -118,7 +118,6 @@ def summary(comparison, runs, point, measured):
     """The `Summary` of runs that differ in their seed."""
     run, out = runs[0], comparison.settings.out
     records = tuple(comparison.records[item] for item in runs)
-    rmse = measured.errors.get("rmse")
     return Summary(
         scene=run.scene,
         tiling=run.tiling,
@@ -138,7 +137,6 @@ def summary(comparison, runs, point, measured):
         us_per_sample=over_seeds(records, "us_per_sample"),
         **{key: records[0][key] for key in render.STRUCTURE},
         nonfinite=sum(record["nonfinite"] for record in records),
-        at_reference_noise=rmse is not None and bool(rmse.total.value**2 <= 2 * rmse.noise**2),
         image=records[0]["image"],
         mean_image=point.mean_image.relative_to(out).as_posix(),
     )

@@ -30,7 +30,7 @@ class Settings:
     scenes: Sequence
     methods: Sequence
     tilings: Sequence[float] = (1.0, 8.0)
-    spps: Sequence[int] = (1, 4, 16)
+    spps: Sequence[int] = (1, 4)
     times: Sequence[float] = ()
     """Budgets for rendering alone, in equal-time comparisons."""
     times_with_build: Sequence[float] = ()
@@ -47,9 +47,10 @@ class Settings:
     frame_depth: int = 3
     """Longest path of the frames, which are there to be looked at and to be timed."""
     sweep: Sequence[float] = ()
-    """Tilings of the sweep over texels per pixel: first crop, first scene."""
+    """Tilings of the sweep over texels per pixel: first crop, first scene; for time per sample of all
+    methods, and for errors of those of the texels."""
     frames: int = 0
-    """Length of the temporal sequence: middle of the first crop, first scene, first tiling."""
+    """Length of the temporal sequence: middle of the first crop, first scene, first tiling; methods of the texels alone."""
     orbit: float = 1.0
     """Degrees that the camera turns in the whole sequence."""
     reference_seconds: float = 8.0
@@ -153,7 +154,7 @@ class RunPlan:
         for method in texels:
             self.sequence += self.sequence_runs(first, method)
         for tiling in settings.sweep:
-            for method in texels:
+            for method in settings.methods:
                 self.sweep += self.sweep_runs(first, tiling, method)
 
     @property
@@ -238,7 +239,8 @@ class ReferenceKey:
 def references(settings):
     """(key, share of a crop's time) of every reference, each once.
 
-    A frame has a reference of the texels only: it is there to be looked at.
+    A frame has a reference of the texels only: it is there to be looked at. So have sequence and sweep; in the sweep,
+    methods of other surfaces are there to be timed.
     """
     wanted = {}
     surfaces = [name for name in SURFACES if any(method.surface == name for method in settings.methods)]

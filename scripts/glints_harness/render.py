@@ -67,16 +67,16 @@ class Run:
     @property
     def file_name(self):
         """The name of the run's image, which is as unique as the run among those of one comparison."""
-        return self.file_of(f"seed{self.seed}")
+        frame = "" if self.view.frame is None else f"frame{self.view.frame:03d}-"
+        return self.file_of(f"{frame}seed{self.seed}")
 
     def file_of(self, which):
-        """The name of an image of this run's point: of a seed, or of the mean over them."""
+        """The name of an image of this run's point: of a seed, of the mean over them, of the excess over time."""
         amount = f"{self.spp}spp"
         if self.time_budget is not None:
             amount = f"{self.time_budget:g}s" + ("-with-build" if self.budget_includes_build else "")
         method = self.method if self.lighting.footprint == "none" else f"{self.method}-{self.lighting.footprint}"
-        frame = "" if self.view.frame is None else f"-frame{self.view.frame:03d}"
-        return f"{self.scene}-x{self.tiling:g}/{self.view.folder}/{method}-{amount}{frame}-{which}.exr"
+        return f"{self.scene}-x{self.tiling:g}/{self.view.folder}/{method}-{amount}-{which}.exr"
 
 
 @dataclass(frozen=True)
@@ -174,18 +174,30 @@ STRUCTURE = {"structure_bytes": int, "build_seconds": float, "bins": int, "refin
 
 
 def structure(scene):
-    """The values of `STRUCTURE` as the scene's glint BSDFs print them; absent if none has it."""
+    """The values of `STRUCTURE` of the scene's glint BSDFs, each counted once; absent if none has it."""
     return structure_of("\n".join(str(shape.bsdf()) for shape in scene.shapes()))
 
 
 def structure_of(text):
-    """The same of a BSDF's description. A method without bins or elements prints 0 of them."""
+    """The same of descriptions of BSDFs: bytes and seconds add up, of bins and refinements the largest counts.
+
+    Descriptions with the same values, the time to the microsecond among them, are of one BSDF, which several shapes, or
+    both sides of one, may have. A method without bins or elements prints 0 of them.
+    """
+    described = {tuple(printed(part, name) for name in STRUCTURE) for part in text.split("GlintBSDF[")}
     found = {}
-    for name, kind in STRUCTURE.items():
-        match = re.search(rf"\b{name}\s*[=:]\s*([0-9.eE+-]+)", text)
-        if match:
-            found[name] = kind(float(match.group(1)))
-    return {name: value for name, value in found.items() if value or name not in ("bins", "refinement")}
+    for (name, kind), column in zip(STRUCTURE.items(), zip(*described)):
+        counts = name in ("bins", "refinement")
+        values = [value for value in column if value is not None and (value or not counts)]
+        if values:
+            found[name] = kind(max(values) if counts else sum(values))
+    return found
+
+
+def printed(text, name):
+    """The number that a description gives for a name, or None."""
+    match = re.search(rf"\b{name}\s*[=:]\s*([0-9.eE+-]+)", text)
+    return match and float(match.group(1))
 
 
 def collect_warnings():

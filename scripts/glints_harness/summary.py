@@ -40,6 +40,17 @@ class ErrorSplit:
     noise: float
     """What an exact image would measure against this reference."""
 
+    def at_noise(self, metric):
+        """Whether this error, that of `metric`, is mostly the reference's own noise.
+
+        Of the squared errors, at least half of the total; of SMAPE and FLIP, where noise and error do not add up, a
+        total of at most 1.5 times the noise; of the mean error, at most two standard errors of the reference's mean.
+        """
+        total = abs(self.total.value)
+        if metric == "rmse":
+            return total**2 <= 2 * self.noise**2
+        return total <= (1.5 if metric in ("smape", "flip") else 2) * self.noise
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -78,8 +89,6 @@ class Summary:
     refinement: int | None
     nonfinite: int
     """Infinite or undefined pixels of all seeds."""
-    at_reference_noise: bool
-    """Whether at least half of the measured squared error is expected to be the reference's own."""
     image: str
     """EXR of the first seed, relative to the output folder."""
     mean_image: str
@@ -89,6 +98,10 @@ class Summary:
     def seconds_with_build(self):
         """Seconds of rendering and of building the data structure."""
         return self.seconds.value + (self.build_seconds or 0.0)
+
+    def at_reference_noise(self, metric):
+        """Whether an error says more about the reference than about the method; False where it is not measured."""
+        return metric in self.errors and self.errors[metric].at_noise(metric)
 
 
 @dataclass(frozen=True)
@@ -111,6 +124,8 @@ class TemporalResult:
     """Largest luminance in each frame."""
     images: tuple
     """EXRs of the frames, relative to the output folder."""
+    excess_image: str | None
+    """EXR of every pixel's excess variance, relative to the output folder; None for the reference."""
 
 
 @dataclass

@@ -50,10 +50,10 @@ def cost_row(results, items, spp):
         bytes_text(formula_bytes(results, first)),
         number(frame and frame.seconds.value),
         number(frame and frame.us_per_sample.value),
-        error_text(crops, "rmse") + (" ≈" if crops and all(item.at_reference_noise for item in crops) else ""),
-        error_text(crops, "relmse"),
-        error_text(crops, "flip"),
-        mean_error_text(results, crops) + invalid_text(items),
+        error_text(crops, "rmse") + noise_mark(crops, "rmse"),
+        error_text(crops, "relmse") + noise_mark(crops, "relmse"),
+        error_text(crops, "flip") + noise_mark(crops, "flip"),
+        mean_error_text(results, crops) + noise_mark(crops, "mean_error") + invalid_text(items),
     )
 
 
@@ -66,6 +66,11 @@ def formula_bytes(results, item):
 def error_text(crops, metric):
     """Mean of an error over the crops."""
     return number(sum(item.errors[metric].total.value for item in crops) / len(crops) if crops else None)
+
+
+def noise_mark(crops, metric):
+    """A mark where an error is mostly the reference's own noise in every crop."""
+    return " ≈" if crops and all(item.at_reference_noise(metric) for item in crops) else ""
 
 
 def mean_error_text(results, crops):

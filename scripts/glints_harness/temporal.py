@@ -12,6 +12,7 @@ luminance of each frame is the trace of Figure 12 of the 2016 paper on filtering
 
 import numpy as np
 
+from .files import write_exr
 from .images import read_exr
 from .plan import ReferenceKey
 from .summary import Estimate, TemporalResult
@@ -46,7 +47,9 @@ def results(comparison):
         if run.view.frame is not None:
             sequences.setdefault(run.point, []).append(record)
     return found + [
-        of_method(settings.out, records, truth) for records in sequences.values() if len(records) == len(views)
+        of_method(settings.out, f"runs/{point.file_of('excess')}", records, truth)
+        for point, records in sequences.items()
+        if len(records) == len(views)
     ]
 
 
@@ -75,15 +78,18 @@ def of_reference(keys, references, truth):
         excess_variance=Estimate(0.0, 0.0, 0.0),
         max_trace=trace(np.stack([reference.mean for reference in references])),
         images=tuple(f"runs/{key.file_name}" for key in keys),
+        excess_image=None,
     )
 
 
-def of_method(out, records, truth):
-    """One method's excess and trace."""
+def of_method(out, excess_image, records, truth):
+    """One method's excess and trace; writes the excess of every pixel to `excess_image`, a path relative to `out`."""
     images = np.stack([read_exr(out / record["image"]) for record in records]).astype(np.float64)
     with np.errstate(invalid="ignore"):
         variance = variance_over_time(images)
-        excess = block_bootstrap((variance - truth).mean(axis=-1))
+        excess = variance - truth
+        write_exr(out / excess_image, excess)
+        mean_excess = block_bootstrap(excess.mean(axis=-1))
     return TemporalResult(
         scene=records[0]["scene"],
         tiling=records[0]["tiling"],
@@ -92,9 +98,10 @@ def of_method(out, records, truth):
         spp=records[0]["spp"],
         frames=len(records),
         variance=float(variance.mean()),
-        excess_variance=excess,
+        excess_variance=mean_excess,
         max_trace=trace(images),
         images=tuple(record["image"] for record in records),
+        excess_image=excess_image,
     )
 
 

@@ -161,11 +161,14 @@ def run(options, say):
 def main(arguments=None):
     """Compare; returns the exit status."""
     options = parser().parse_args(arguments)
-    mi.set_variant("scalar_rgb")
     try:
+        mi.set_variant("scalar_rgb")
         return run(options, (lambda _: None) if options.quiet else print)
     except (statistic.BadInput, OSError) as error:
         print(f"imagediff: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except Exception as error:  # noqa: BLE001 (an exit status of 1 would mean that images differ)
+        print(f"imagediff: unexpected {type(error).__name__}: {error}", file=sys.stderr)
         return BAD_INPUT
 
 

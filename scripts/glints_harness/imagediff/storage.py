@@ -57,7 +57,10 @@ def read_exr(path):
     pixels = pixels.reshape(*pixels.shape[:2], -1)
     names = [field.name for field in bitmap.struct_()]
     metadata = bitmap.metadata()
-    attribute = json.loads(metadata[ATTRIBUTE]) if ATTRIBUTE in metadata else None
+    try:
+        attribute = json.loads(metadata[ATTRIBUTE]) if ATTRIBUTE in metadata else None
+    except ValueError as error:
+        raise BadInput(f"{path} is a stored reference with a broken header; make it again with --store") from error
     return Exr({name: pixels[..., index] for index, name in enumerate(names)}, attribute)
 
 

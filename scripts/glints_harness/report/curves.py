@@ -54,10 +54,8 @@ def convergence(summaries, scene, tiling, view, metric, axis):
 
 
 def belongs(item, axis):
-    """Whether a summary is a point over this axis. An equal-time point belongs to the time that it was to fill."""
-    if item.time_budget is None:
-        return True
-    return axis == ("build" if item.budget_includes_build else "seconds")
+    """Whether a summary is a point over this axis. One whose budget had to pay for the structure, too, belongs there."""
+    return item.time_budget is None or not item.budget_includes_build or axis == "build"
 
 
 def error_point(item, metric, axis):
@@ -94,7 +92,7 @@ def sweep_plots(results):
             ("rmse", "RMSE (radiance)", lambda item: sweep_error(item, "rmse")),
             ("flip", "HDR-FLIP", lambda item: sweep_error(item, "flip")),
         ):
-            measured = [item for item in mine if quantity == "time" or item.errors]
+            measured = [item for item in mine if quantity == "time" or (item.errors and item.surface == "texels")]
             found[scene, quantity] = plots.Plot(
                 name=f"{scene}-{quantity}-over-tiling",
                 title=f"{scene.capitalize()}, {view_title(mine[0].view)}, {mine[0].spp} spp",

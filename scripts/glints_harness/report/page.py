@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from markupsafe import Markup
 
-from .. import images, metrics, paper
+from .. import flip, images, metrics, paper
 from ..files import json_ready, write_text
 from ..summary import select
 from . import animation, curves, pictures, plots, tables, workers
@@ -47,7 +47,8 @@ def write(results):
         results=results,
         settings=results.settings,
         epsilon=metrics.RELMSE_EPSILON,
-        exposures=metrics.FLIP_EXPOSURES,
+        exposures=flip.EXPOSURES,
+        paper=paper,
         precision=precision(),
         metrics=METRIC_TITLES,
         axes=AXES,
@@ -224,7 +225,7 @@ def error_cases(results):
                     "id": case_id(scene.name, tiling),
                     "title": case_title(scene.name, tiling),
                     "views": sorted({item.view for item in mine if item.view != "frame"}),
-                    "tables": {metric: tables.error_table(mine, metric) for metric in METRIC_TITLES},
+                    "tables": {metric: tables.error_table(results, mine, metric) for metric in METRIC_TITLES},
                 }
             )
     return cases
@@ -242,6 +243,7 @@ def sequence(results, scene, tiling):
     paths = [[results.out / image for image in item.images] for item in mine]
     file = results.out / "animations" / f"{case_id(scene, tiling)}.webp"
     made = animation.write(file, list(zip(captions, paths)), results.exposure)
+    flickering = [(short_label(item), results.out / item.excess_image) for item in mine if item.excess_image]
     return {
         "title": case_title(scene, tiling),
         "plot": f"trace/{case_id(scene, tiling)}",
@@ -251,4 +253,12 @@ def sequence(results, scene, tiling):
         "height": made.height,
         "alt": ", ".join(captions),
         "file": file.name,
+        "excess": excess_picture(file.with_name(f"{file.stem}-excess.png"), flickering) if flickering else None,
     }
+
+
+def excess_picture(file, panels):
+    """The excess variance of one scene at one tiling, from pairs (caption, path)."""
+    limit = animation.write_excess(file, panels)
+    alt = ", ".join(caption for caption, _ in panels)
+    return {"uri": images.data_uri(file), "limit": number(limit, 2), "alt": alt}

@@ -6,11 +6,13 @@ packed data (see `images.pack`), and tone-maps it itself.
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 
-from .. import images, metrics
+from .. import images
 from ..files import digest_text
+from ..flip import flip_map
 from ..summary import select
 from .text import (
     case_id,
@@ -22,7 +24,6 @@ from .text import (
     view_title,
     with_interval,
 )
-from .workers import flip_map
 
 CROP_MANTISSA = 7
 """Stored bits of the mantissa of a crop's pixels: values are right to 0.4 %, a third of an 8-bit step of brightness."""
@@ -70,7 +71,7 @@ class Gallery:
         """Have the FLIP map of a shot computed, if it has one: an image with an infinite pixel has none."""
         if np.isfinite(image).all():
             identity = f"fl{index}"
-            self.awaited[identity] = self.pool.submit(flip_map, image, reference, metrics.FLIP_EXPOSURES)
+            self.awaited[identity] = self.pool.submit(flip_map, image, reference)
             self.shots[index]["flip"] = identity
 
     def finish(self):
@@ -105,13 +106,13 @@ def show_view(results, found, scene, tiling, view, summaries, views):
     """One view: groups of pictures with the same sample count, each with the references at its end."""
     references = add_references(results, found, scene, tiling, view)
     mine = select(summaries, view=view.name)
+    wanted = {long_label(item): item.method for item in (*mine, *left_out(results, scene, tiling, view))}
     entries = [index for index, _ in references.values()]
     groups = []
     for title, members, mean in sample_groups(mine, view):
         shots = [add_summary(results, found, item, view, mean, references) for item in members]
         there = {long_label(item) for item in members}
-        absent = {long_label(item): item.method for item in mine if long_label(item) not in there}
-        gaps = [{"label": label, "method": method} for label, method in absent.items()]
+        gaps = [{"label": label, "method": method} for label, method in wanted.items() if label not in there]
         groups.append({"title": title, "mean": mean, "shots": shots + entries, "absent": gaps})
     if entries and not groups:
         groups.append({"title": "reference only", "mean": False, "shots": entries, "absent": []})
@@ -126,6 +127,12 @@ def show_view(results, found, scene, tiling, view, summaries, views):
         "place": f"{view.crop[2]} × {view.crop[3]} pixels at ({view.crop[0]}, {view.crop[1]}) of {view.width} × {view.height}",
         "groups": groups,
     }
+
+
+def left_out(results, scene, tiling, view):
+    """The points of a view that have no picture."""
+    points = [SimpleNamespace(**item) for item in results.left_out]
+    return select(points, scene=scene.name, tiling=tiling, view=view.name, frame=None)
 
 
 def sample_groups(summaries, view):
@@ -159,7 +166,7 @@ def add_summary(results, found, item, view, mean, references):
         label=long_label(item),
         detail=f"{f'{rows} × ' if mean else ''}{sample_text(item)} · {seconds_text(rows * item.seconds.value)}",
         errors={} if mean else {name: with_interval(split.total, 2) for name, split in item.errors.items()},
-        noisy=item.at_reference_noise,
+        noisy=[name for name in item.errors if item.at_reference_noise(name)],
     )
     if item.surface in references:
         number_of_reference, reference = references[item.surface]
@@ -181,7 +188,7 @@ def add_references(results, found, scene, tiling, view):
                 label=f"Reference · {surface}",
                 detail=f"{reference.spp}\u00a0spp · {seconds_text(reference.seconds)}",
                 errors={"rmse": number(root_mean_square(reference.standard_error), 2)},
-                noisy=True,
+                noisy=[],
             )
             found.shots[index]["reference"] = index
             added[surface] = (index, reference)

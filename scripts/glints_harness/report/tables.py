@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 from .. import paper
 from ..summary import select
-from ..tables import formula_bytes
+from ..tables import formula_bytes, mean_error_text
 from .curves import METRIC_TITLES
 from .text import (
     bytes_text,
@@ -13,7 +13,6 @@ from .text import (
     interval,
     method_label,
     number,
-    percent,
     sample_text,
     seconds_text,
     signed,
@@ -164,7 +163,7 @@ def memory_cell(measured, scene, alpha):
 # ---- errors ----------------------------------------------------------------------------------------------------------
 
 
-def error_table(summaries, metric):
+def error_table(results, summaries, metric):
     """One error of every summary of a case, split into bias and variance."""
     columns = [
         Column("method and footprint rule", text=True),
@@ -178,7 +177,7 @@ def error_table(summaries, metric):
         Column("invalid pixels"),
     ]
     measured = [item for item in summaries if metric in item.errors]
-    return table(columns, [error_row(item, metric) for item in measured], group_by=(0, 1))
+    return table(columns, [error_row(results, item, metric) for item in measured], group_by=(0, 1))
 
 
 def split_columns(metric):
@@ -192,13 +191,13 @@ def split_columns(metric):
     return [Column(first), Column("variance" if metric == "relmse" else "rest"), Column("shares", text=True)]
 
 
-def error_row(item, metric):
+def error_row(results, item, metric):
     """One summary's error and its split."""
     split = item.errors[metric]
-    noise_mark = " ≈" if item.at_reference_noise and metric in ("rmse", "relmse") else ""
+    noise_mark = " ≈" if item.at_reference_noise(metric) else ""
     shown = signed if metric == "mean_error" else number
     if metric == "mean_error":
-        parts = [Cell(relative_mean_error(item)), estimate_cell(split.variance)]
+        parts = [Cell(mean_error_text(results, [item])), estimate_cell(split.variance)]
     else:
         parts = [estimate_cell(split.bias), estimate_cell(split.variance), Cell("", shares=shares(split))]
     if metric == "rmse":
@@ -220,12 +219,6 @@ def error_row(item, metric):
 def estimate_cell(estimate):
     """An estimate with its interval below; a dash where a single seed cannot tell."""
     return Cell("–") if estimate is None else Cell(number(estimate.value), interval(estimate))
-
-
-def relative_mean_error(item):
-    """The mean error as a share of the reference's mean."""
-    reference = item.runs[0].get("mean_reference")
-    return percent(item.errors["mean_error"].total.value / reference) if reference else "–"
 
 
 def shares(split):
@@ -340,7 +333,7 @@ def left_out_table(results):
         Column("method", text=True),
         Column("view", text=True),
         Column("samples", text=True),
-        Column("because of", text=True),
+        Column("reason", text=True),
         Column("predicted time", "s"),
     ]
     rows = [

@@ -134,9 +134,10 @@ function hover(position) {
 
 function describe(shot) {
   const parts = [shot.detail];
+  const error = (name) => shot.errors[name] + (shot.noisy.includes(name) ? " ≈" : "");
   if (shot.method === "reference") parts.push(`own noise (RMSE) ${shot.errors.rmse}`);
-  else if (shot.errors.rmse) parts.push(`RMSE ${shot.errors.rmse}${shot.noisy ? " ≈" : ""}`);
-  if (shot.errors.flip) parts.push(`FLIP ${shot.errors.flip}`);
+  else if (shot.errors.rmse) parts.push(`RMSE ${error("rmse")}`);
+  if (shot.errors.flip) parts.push(`FLIP ${error("flip")}`);
   if (shot.invalid) parts.push(`${shot.invalid} invalid ${shot.invalid === 1 ? "pixel" : "pixels"}`);
   return parts;
 }
