@@ -321,15 +321,11 @@ def test_points_are_rendered_whole_or_left_out(mini):
     assert found[-1].run == dear[0] and found[-1].predicted_seconds > 30 and found[-1].reason == "the time limit"
 
 
-def test_equal_time_fills_its_budget(mini):
-    wanted = [replace(RUN, spp=None, time_budget=0.3, seed=seed) for seed in (1, 2)]
-    filled = []
-    # The machine may be busy with something else meanwhile.
-    while len(filled) < 5 and not any(0.75 < share < 1.33 for share in filled):
-        found = outcomes_of(mini, wanted)
-        assert len({item.spp for item in found}) == 1 and found[0].spp > 10
-        filled.append(sum(item.seconds for item in found) / 2 / 0.3)
-    assert 0.75 < filled[-1] < 1.33, filled
+def test_equal_time_takes_the_same_samples_for_all_seeds(mini):
+    """How well the budget is filled is tested on a stand-in below: a busy machine has no say in it."""
+    found = outcomes_of(mini, [replace(RUN, spp=None, time_budget=0.3, seed=seed) for seed in (1, 2)])
+    assert [item.run.seed for item in found] == [1, 2]
+    assert len({item.spp for item in found}) == 1 and found[0].spp > 1
 
 
 class Steady:
