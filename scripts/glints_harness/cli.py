@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 DEFAULT_SPPS = (1, 4)
 DEFAULT_TIMES = (0.15,)
-DEFAULT_LIMIT = 430.0
+DEFAULT_LIMIT = 450.0
 """Seconds; see `Settings.limit`. Keeps the default comparison under eight minutes, the report included."""
 
 EPILOG = """

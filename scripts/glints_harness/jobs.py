@@ -154,13 +154,14 @@ class Stopwatch:
     def fill(self, run, budget):
         """Samples per pixel that fill `budget` seconds; None if a single one takes too long.
 
-        The cost of a sample depends on their number: try, then scale.
+        The cost of a sample depends on their number, with footprints that shrink: try, scale, and try again.
         """
         if self.predict(run, 1) > PILOT_TOLERANCE * budget:
             return None
-        self.render(run, max(1, int(TRIAL * budget / self.predict(run, 1))), seed=0)
-        if self.predict(run, 1) > TOLERANCE * budget:
-            return None
+        for share in (TRIAL, 1.0):
+            self.render(run, max(1, int(share * budget / self.predict(run, 1))), seed=0)
+            if self.predict(run, 1) > TOLERANCE * budget:
+                return None
         return max(1, int(budget / self.predict(run, 1)))
 
     def finish(self, run, spp):

@@ -13,9 +13,11 @@ from .scenes import View, scene_digest
 FIRST_SEED = 1
 """Seeds of measured runs count up from here; those of the references lie far away."""
 
-SWEEP_SPP = 4
+SWEEP_SPP = 1
+"""Samples per pixel of the tiling sweep: footprints are widest, a pixel's own."""
+
 SEQUENCE_SPP = 4
-"""Samples per pixel of the tiling sweep and of the temporal sequence."""
+"""Samples per pixel of the temporal sequence."""
 
 MINOR_SHARE = 1 / 3
 SEQUENCE_SHARE = 1 / 5
