@@ -178,7 +178,7 @@ class Once(executors.Local):
         if len(self.passes) == 1:
             for job in waiting:
                 spared = tuple(run for run in job.runs if run.spp == 1)
-                for runs_of_point in jobs.points(tuple(run for run in job.runs if run.spp != 1)):
+                for runs_of_point in render.by_point(run for run in job.runs if run.spp != 1).values():
                     receive(jobs.LeftOut(runs_of_point[0], "the time limit", 1.0, final=runs_of_point[0].spp == 9))
                 for outcome in replace(job, runs=spared).carry_out():
                     receive(outcome)

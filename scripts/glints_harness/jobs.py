@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from . import provenance
 from .plan import ReferenceKey, is_measured
 from .reference import Reference
-from .render import Lighting, LoadedScene, Run
+from .render import Lighting, LoadedScene, Run, by_point
 from .runs import Finished
 
 LOAD_SECONDS = 1.0
@@ -87,7 +87,7 @@ class RenderJob:
         stopwatch = Stopwatch(loaded)
         now = time.perf_counter()
         end = now + max(seconds - (now - start), seconds / 2)
-        for runs in points(self.runs):
+        for runs in by_point(self.runs).values():
             budget = rendering_budget(runs[0], loaded)
             if budget is not None and budget <= 0:
                 reason = "the time budget is shorter than building the data structure"
@@ -106,14 +106,6 @@ class RenderJob:
             for run in runs:
                 yield stopwatch.finish(run, spp)
             end -= owed
-
-
-def points(runs):
-    """Runs that differ in their seed only, together, in the order of the first of them."""
-    groups = {}
-    for run in runs:
-        groups.setdefault(run.point, []).append(run)
-    return list(groups.values())
 
 
 def rendering_budget(run, loaded):

@@ -57,10 +57,7 @@ def summaries(comparison):
 
     References get their `noise`, too.
     """
-    groups = {}
-    for run in comparison.records:
-        if run.view.frame is None:
-            groups.setdefault(run.point, []).append(run)
+    groups = render.by_point(run for run in comparison.records if run.view.frame is None)
     cores = comparison.executor.machine["cores"]
     with workers(len(comparison.records), cores) as each:
         keys = [key for key in comparison.references if is_measured(key.view)]

@@ -91,6 +91,14 @@ class Rendering:
     """Processor seconds over all threads."""
 
 
+def by_point(runs):
+    """{`Run.point`: its runs}, in the order of the first run of each."""
+    groups = {}
+    for run in runs:
+        groups.setdefault(run.point, []).append(run)
+    return groups
+
+
 class LoadedScene:
     """A scene in Mitsuba's memory, and what its glint BSDF says about its data structure."""
 

@@ -15,6 +15,7 @@ import numpy as np
 from .files import write_exr
 from .images import read_exr
 from .plan import ReferenceKey
+from .render import by_point
 from .summary import Estimate, TemporalResult
 
 BLOCK = 8
@@ -42,14 +43,11 @@ def results(comparison):
     references = [comparison.references[key] for key in keys]
     truth = true_variance(references)
     found = [of_reference(keys, references, truth)]
-    sequences = {}
-    for run, record in comparison.records.items():
-        if run.view.frame is not None:
-            sequences.setdefault(run.point, []).append(record)
+    sequences = by_point(run for run in comparison.records if run.view.frame is not None)
     return found + [
-        of_method(settings.out, f"runs/{point.file_of('excess')}", records, truth)
-        for point, records in sequences.items()
-        if len(records) == len(views)
+        of_method(settings.out, f"runs/{point.file_of('excess')}", [comparison.records[run] for run in runs], truth)
+        for point, runs in sequences.items()
+        if len(runs) == len(views)
     ]
 
 
