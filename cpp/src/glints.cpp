@@ -39,9 +39,51 @@ bridge::MaskingKind to_bridge(Masking masking) {
     }
 }
 
+bridge::FlakeDistribution to_bridge(Distribution distribution) {
+    return distribution == Distribution::Ggx ? bridge::FlakeDistribution::Ggx : bridge::FlakeDistribution::Beckmann;
+}
+
+bridge::StructureKind to_bridge(Structure structure) {
+    switch (structure) {
+    case Structure::Compact:
+        return bridge::StructureKind::Compact;
+    case Structure::Paper:
+        return bridge::StructureKind::Paper;
+    default:
+        return bridge::StructureKind::Automatic;
+    }
+}
+
+bridge::BinningKind to_bridge(Binning binning) {
+    switch (binning) {
+    case Binning::Projected:
+        return bridge::BinningKind::Projected;
+    case Binning::EqualSolidAngle:
+        return bridge::BinningKind::EqualSolidAngle;
+    default:
+        return bridge::BinningKind::Automatic;
+    }
+}
+
 bridge::Surface to_bridge(const SurfaceOptions &o) {
-    return {o.alpha, o.normalization == Normalization::Projected, to_bridge(o.masking), o.masking_alpha_u,
-            o.masking_alpha_v};
+    return {to_bridge(o.distribution), o.alpha,           o.normalization == Normalization::Projected,
+            to_bridge(o.masking),      o.masking_alpha_u, o.masking_alpha_v};
+}
+
+Drawn from_bridge(bridge::Drawn drawn) {
+    switch (drawn) {
+    case bridge::Drawn::Flake:
+        return Drawn::Flake;
+    case bridge::Drawn::Gap:
+        return Drawn::Gap;
+    default:
+        return Drawn::Nothing;
+    }
+}
+
+Statistics from_bridge(const bridge::Statistics &s) {
+    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds, s.bins,
+            s.refinement,          s.masking_alpha_u, s.masking_alpha_v};
 }
 
 // A Rust string holds nothing else.
@@ -108,8 +150,10 @@ Brdf::~Brdf() = default;
 
 Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, const InverseBinMapOptions &options) {
     return translated([&] {
-        return Brdf(std::make_unique<Impl>(
-            Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), options.bins, options.leaf_size)}));
+        bridge::InverseBinMapOptions given{to_bridge(options.structure), options.bins, options.leaf_size,
+                                           to_bridge(options.binning)};
+        return Brdf(
+            std::make_unique<Impl>(Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), given)}));
     });
 }
 
@@ -154,10 +198,43 @@ float Brdf::ndf(const Footprint &footprint, const Vec3 &h) const noexcept {
     return m_impl->brdf->ndf(to_bridge(footprint), to_bridge(h));
 }
 
-Statistics Brdf::statistics() const {
-    auto s = m_impl->brdf->statistics();
-    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds, s.bins,
-            s.refinement,          s.masking_alpha_u, s.masking_alpha_v};
+Statistics Brdf::statistics() const { return from_bridge(m_impl->brdf->statistics()); }
+
+// ---- FlakeLayer --------------------------------------------------------------------------------------------------------------
+
+struct FlakeLayer::Impl {
+    rust::Box<bridge::FlakeLayer> layer;
+};
+
+FlakeLayer::FlakeLayer(std::unique_ptr<Impl> impl) : m_impl(std::move(impl)) {}
+FlakeLayer::FlakeLayer(FlakeLayer &&) noexcept = default;
+FlakeLayer &FlakeLayer::operator=(FlakeLayer &&) noexcept = default;
+FlakeLayer::~FlakeLayer() = default;
+
+FlakeLayer FlakeLayer::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
+                                       const FlakeLayerOptions &o) {
+    return translated([&] {
+        bridge::FlakeLayerOptions options{o.method.bins, o.method.leaf_size, o.gtr_gamma, o.gtr_alpha, o.largest_sine};
+        return FlakeLayer(std::make_unique<Impl>(
+            Impl{bridge::flake_layer(*map.m_impl->map, utf8(o.mask), to_bridge(surface), options)}));
+    });
 }
+
+float FlakeLayer::cover(const Footprint &footprint) const noexcept {
+    return m_impl->layer->cover(to_bridge(footprint));
+}
+
+Evaluation FlakeLayer::evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept {
+    auto e = m_impl->layer->evaluate(to_bridge(footprint), to_bridge(wi), to_bridge(wo));
+    return {e.value, e.pdf};
+}
+
+FlakeSample FlakeLayer::sample(const Footprint &footprint, const Vec3 &wi, float u1, float u2,
+                               float u3) const noexcept {
+    auto s = m_impl->layer->sample(to_bridge(footprint), to_bridge(wi), {u1, u2, u3});
+    return {from_bridge(s.drawn), from_bridge(s.wo)};
+}
+
+Statistics FlakeLayer::statistics() const { return from_bridge(m_impl->layer->statistics()); }
 
 } // namespace glints

@@ -62,18 +62,41 @@ enum class Masking : uint8_t {
     Explicit, ///< the same with `masking_alpha_u`, `masking_alpha_v`
 };
 
+/// The distribution of the microfacets of one flake.
+enum class Distribution : uint8_t {
+    Beckmann, ///< Gaussian slopes
+    Ggx,      ///< a heavy tail: a sixth of the lobe is beyond Beckmann's three standard deviations
+};
+
 /// Parameters that every method shares.
 struct GLINTS_API SurfaceOptions {
-    float alpha = 0.01f; ///< Beckmann roughness of a flake, in [1e-4, 1]
+    float alpha = 0.01f; ///< roughness of a flake, in [1e-4, 1]; 0 is a mirror, for `Brdf::inverse_bin_map` only
+    Distribution distribution = Distribution::Beckmann;
     Normalization normalization = Normalization::Projected;
     Masking masking = Masking::Beckmann;
     float masking_alpha_u = 0.f, masking_alpha_v = 0.f; ///< only for `Masking::Explicit`; both >= 0
 };
 
-/// Parameters of the inverse bin map; zero means "derive it as the paper does".
+/// How the hemisphere of normals is cut into bins.
+enum class Binning : uint8_t {
+    Automatic,       ///< `EqualSolidAngle` if alpha is 0, else `Projected`
+    Projected,       ///< squares on the projected hemisphere, as in Atanasov et al. 2021
+    EqualSolidAngle, ///< cells of one solid angle, as in the talk of 2020; only with alpha = 0
+};
+
+/// Data structures of the inverse bin map.
+enum class Structure : uint8_t {
+    Automatic, ///< `Paper` with alpha = 0, `bins`, `leaf_size` or `binning`, which only it has; else `Compact`
+    Compact,   ///< this project's: half the memory, lobes where the map has them
+    Paper,     ///< that of Atanasov et al. 2021, and with alpha = 0 of their talk of 2020
+};
+
+/// Parameters of the inverse bin map; those of the paper's structure may be zero, "derive it as the paper does".
 struct GLINTS_API InverseBinMapOptions {
-    uint32_t bins = 0;      ///< bins per side of the square around the projected hemisphere; 0: floor(5 / sin theta_0)
-    uint32_t leaf_size = 0; ///< most texels of a leaf of the forest; 0: the paper's 10
+    Structure structure = Structure::Automatic;
+    uint32_t bins = 0;      ///< bins per side; 0: floor(5 / sin theta_0), which alpha = 0 does not have
+    uint32_t leaf_size = 0; ///< most texels of a leaf of the forest; 0: the paper's 10, with alpha = 0 the talk's 16
+    Binning binning = Binning::Automatic;
 };
 
 /// What the surface is between the centres of a map's texels.
@@ -131,12 +154,13 @@ private:
     explicit NormalMap(std::unique_ptr<Impl>);
     std::unique_ptr<Impl> m_impl;
     friend class Brdf;
+    friend class FlakeLayer;
 };
 
 /// What a method built, for tables and logs.
 struct Statistics {
     std::string method;
-    float alpha;                            ///< Beckmann roughness of a flake
+    float alpha;                            ///< roughness of a flake; 0: a mirror
     uint64_t structure_bytes;               ///< memory that `evaluate`, `pdf` and `sample` need
     double build_seconds;                   ///< wall time of the construction, without reading the file
     uint32_t bins;                          ///< bins per side; 0 for methods without bins
@@ -147,7 +171,8 @@ struct Statistics {
 /// A normal map filtered over footprints by one of the methods.
 class GLINTS_API Brdf {
 public:
-    /// Inverse bin map, Atanasov et al. 2021 (Sections 5.2-5.4).
+    /// Inverse bin map, Atanasov et al. 2021 (Sections 5.2-5.4); with `surface.alpha = 0` that of their talk of 2020,
+    /// which needs `options.bins`.
     static Brdf inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
                                 const InverseBinMapOptions &options = {});
     /// The exact sum over every texel of the footprint (Eq. 11).
@@ -155,7 +180,8 @@ public:
     /// The normal under the footprint's centre (Eq. 5), whatever the footprint.
     static Brdf unfiltered(const NormalMap &map, const SurfaceOptions &surface,
                            Interpolation interpolation = Interpolation::Nearest);
-    /// Position-normal distribution of 4D Gaussians, Yan et al. 2016. `surface.normalization` has to be `Projected`.
+    /// Position-normal distribution of 4D Gaussians, Yan et al. 2016. `surface.normalization` has to be `Projected`,
+    /// and `surface.distribution` `Beckmann`.
     static Brdf yan16(const NormalMap &map, const SurfaceOptions &surface, const Yan16Options &options = {});
 
     Evaluation evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept;
@@ -176,6 +202,55 @@ public:
 
 private:
     explicit Brdf(std::unique_ptr<Impl>);
+    std::unique_ptr<Impl> m_impl;
+};
+
+/// Parameters of a layer of flakes besides `SurfaceOptions`.
+struct GLINTS_API FlakeLayerOptions {
+    InverseBinMapOptions method;
+    std::string mask;         ///< image of the normal map's size, >= 1/2 where a texel holds a flake; empty: all do
+    float gtr_gamma = 0.f;    ///< exponent of a GTR distribution whose Smith term is G_x; 0: that of `SurfaceOptions`
+    float gtr_alpha = 0.f;    ///< its roughness
+    float largest_sine = 1.f; ///< of the angles between z and all directions asked about; 1 / eta under a coat
+};
+
+/// What a draw from a layer of flakes came upon.
+enum class Drawn : uint8_t {
+    Flake,   ///< a flake, which reflects to `wo`
+    Gap,     ///< a texel without flake
+    Nothing, ///< a flake that reflects nowhere; counts as zero
+};
+
+struct FlakeSample {
+    Drawn drawn;
+    Vec3 wo; ///< its value and density are those of `evaluate`
+};
+
+/// A normal map of flakes with gaps between them, filtered by the inverse bin map.
+///
+/// Values and densities are those of the flakes alone, in proportion to their share of the footprint: what is below the
+/// layer adds its own, times `1 - cover`.
+class GLINTS_API FlakeLayer {
+public:
+    static FlakeLayer inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
+                                      const FlakeLayerOptions &options = {});
+
+    /// The share of the footprint that flakes cover.
+    float cover(const Footprint &footprint) const noexcept;
+    Evaluation evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept;
+    /// Draws a texel of the footprint and what is there. `u1`, `u2`, `u3` are independent and uniform on [0, 1).
+    FlakeSample sample(const Footprint &footprint, const Vec3 &wi, float u1, float u2, float u3) const noexcept;
+
+    /// With the mip map of the mask in `structure_bytes`.
+    Statistics statistics() const;
+
+    struct Impl;
+    FlakeLayer(FlakeLayer &&) noexcept;
+    FlakeLayer &operator=(FlakeLayer &&) noexcept;
+    ~FlakeLayer();
+
+private:
+    explicit FlakeLayer(std::unique_ptr<Impl>);
     std::unique_ptr<Impl> m_impl;
 };
 

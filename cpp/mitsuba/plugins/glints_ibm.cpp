@@ -3,7 +3,8 @@ Glints by an inverse bin map (`glints_ibm`)
 ===========================================
 
 A surface of specular flakes given by a normal map, whose reflection is filtered over each pixel's footprint:
-Atanasov et al., "A Multiscale Microfacet Model Based on Inverse Bin Mapping" (2021).
+Atanasov et al., "A Multiscale Microfacet Model Based on Inverse Bin Mapping" (2021). With `alpha` = 0 the flakes are
+mirrors: Atanasov et al., "Efficient Multiscale Rendering of Specular Microstructure" (2020).
 
 Parameters that all glint BSDFs share
 -------------------------------------
@@ -19,7 +20,9 @@ Parameters that all glint BSDFs share
 | `flip_y`               | boolean       | Negates the green component, for maps with y downwards. (Default: false)   |
 | `tiles`                | float         | Repetitions of the map over one unit of uv. (Default: 1)                   |
 | `to_uv`                | transform     | 3x3 transform of uv, applied before `tiles`. (Default: identity)           |
-| `alpha`                | float         | Beckmann roughness of one flake (texel), in [0.0001, 1]. (Default: 0.01)   |
+| `alpha`                | float         | Roughness of one flake (texel), in [0.0001, 1]. (Default: 0.01)            |
+| `distribution`         | string        | Microfacets of one flake: `beckmann`, or `ggx` with a heavy tail, which    |
+|                        |               | puts a glow around every glint. (Default: `beckmann`)                      |
 | `material`             | string        | Conductor from Mitsuba's library, such as `Cu` or `Al`, or `none`.         |
 | `eta`, `k`             | spectrum or   | Conductor: real and imaginary part of the index of refraction. Both are    |
 |                        | texture       | needed. Instead of `material`. *Exposed*                                   |
@@ -44,16 +47,30 @@ Parameters of this plugin
 
 | Parameter   | Type    | Meaning                                                                                      |
 |-------------|---------|----------------------------------------------------------------------------------------------|
-| `bins`      | integer | Bins per side of the square around the projected hemisphere of normals. 0: as many as the    |
-|             |         | flakes' roughness asks for. (Default: 0)                                                     |
+| `structure` | string  | `compact`: this project's structure, half as large, with lobes where the map has them.       |
+|             |         | `paper`: that of the publication, lobes at the centres of bins. (Default: `compact`; `paper` |
+|             |         | where one of the following parameters is given or `alpha` is 0: they are the paper's alone)  |
+| `alpha`     | float   | As above, or 0: each flake is a mirror, shown in the resolution of the bins, without shadow- |
+|             |         | ing of its own.                                                                              |
+| `bins`      | integer | Bins per side of the grid over the hemisphere of normals. 0: as many as the flakes'          |
+|             |         | roughness asks for. Required with `alpha` = 0. (Default: 0)                                  |
+| `binning`   | string  | How the hemisphere is cut. `projected`: squares on the projected hemisphere.                 |
+|             |         | `equal_solid_angle`: cells of one solid angle, only with `alpha` = 0, and there the default. |
+|             |         | (Default with roughness: `projected`)                                                        |
 | `leaf_size` | integer | Most texels in a leaf of the forest over the map. Larger: less memory, slower evaluation. 0: |
-|             |         | the paper's 10. (Default: 0)                                                                 |
+|             |         | the paper's 10, with `alpha` = 0 its 16. (Default: 0)                                        |
 
 Guidance
 --------
 
 - `alpha` is the roughness of a single flake, not of the surface: that comes from the map. 0.0025 gives hard, sparse
   glints, 0.16 a smooth look with hardly any. Half of it asks for four times the bins.
+- `distribution` = `ggx`: a lobe is cut off at seven times its roughness, 2 % of it lie outside and are moved inside. In the
+  paper's structure the bins around a normal hold 83 % of its lobe; the rest of the tail is moved into them, so that
+  energy is kept, but little of the glow is seen. A quarter of the `bins` holds 99 %; `glints_direct` shows all of it.
+- `alpha` = 0: the talk shows car paint with 127 bins a side, scratched metal with 63 (4K maps) and 255 (8K). A bin is
+  as large as a disk of radius 1.4 / `bins` radians: every flake reflects into a lobe of that width, and the reflections
+  of small lights show the bins' outlines where a footprint covers few flakes.
 - The footprint comes from ray differentials. Render with `glints_path` (of this package) or with `direct`: Mitsuba's
   other integrators drop the differentials, and the BSDF then shows single texels and says so once.
 - With many samples per pixel Mitsuba shrinks the footprint to that of one sample; see `footprint` of `glints_path`.
@@ -88,8 +105,16 @@ Python:
 static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::NormalMap &map,
                               const glints::SurfaceOptions &surface) {
     glints::InverseBinMapOptions options;
+    if (props.has_property("structure")) {
+        size_t choice = glints_mitsuba::choice_parameter(props, "structure", {"compact", "paper"});
+        options.structure = choice == 0 ? glints::Structure::Compact : glints::Structure::Paper;
+    }
     options.bins = glints_mitsuba::unsigned_parameter(props, "bins", 0);
     options.leaf_size = glints_mitsuba::unsigned_parameter(props, "leaf_size", 0);
+    if (props.has_property("binning")) {
+        size_t choice = glints_mitsuba::choice_parameter(props, "binning", {"projected", "equal_solid_angle"});
+        options.binning = choice == 0 ? glints::Binning::Projected : glints::Binning::EqualSolidAngle;
+    }
     return glints::Brdf::inverse_bin_map(map, surface, options);
 }
 

@@ -9,7 +9,8 @@ of most later papers. Written from the mathematics.
 Parameters of this plugin
 -------------------------
 
-The common ones are documented in `glints_ibm.cpp`. `normalization` can only be `projected`.
+The common ones are documented in `glints_ibm.cpp`. `normalization` can only be `projected`, `distribution` only
+`beckmann`: the elements are Gaussian.
 
 | Parameter         | Type    | Meaning                                                                                |
 |-------------------|---------|----------------------------------------------------------------------------------------|

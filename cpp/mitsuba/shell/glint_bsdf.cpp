@@ -19,14 +19,6 @@ using namespace mitsuba;
 
 namespace {
 
-glints::NormalMap load_map(const Parameters &parameters) {
-    try {
-        return glints::NormalMap::load(parameters.filename, parameters.encoding, parameters.flip_y);
-    } catch (const glints::Error &e) {
-        Throw("%s: %s", parameters.plugin, e.what()); // names the parameter and the file
-    }
-}
-
 glints::Brdf make_brdf(const Method &method, const Properties &props, const Parameters &parameters,
                        const glints::NormalMap &map) {
     try {
@@ -36,10 +28,8 @@ glints::Brdf make_brdf(const Method &method, const Properties &props, const Para
     }
 }
 
-/// A plugin and, if it has one, its name in the scene: `glints_ibm "flakes"`.
-std::string described(const Properties &props) {
-    std::string plugin(props.plugin_name());
-    return props.id().empty() ? plugin : plugin + " \"" + std::string(props.id()) + "\"";
+const char *distribution_name(glints::Distribution distribution) {
+    return distribution == glints::Distribution::Ggx ? "ggx" : "beckmann";
 }
 
 glints::Vec3 vec3(const Vector<float, 3> &v) { return {v.x(), v.y(), v.z()}; }
@@ -112,6 +102,7 @@ public:
             << "  plugin = " << m_parameters.plugin << ",\n"
             << "  filename = \"" << m_parameters.filename << "\",\n"
             << "  resolution = " << m_width << " x " << m_height << ",\n"
+            << "  distribution = " << distribution_name(m_parameters.surface.distribution) << ",\n"
             << "  alpha = " << s.alpha << ",\n"
             << "  tiles = " << m_parameters.tiles << ",\n"
             << "  to_uv = " << string::indent(m_parameters.to_uv.matrix, 10) << ",\n"

@@ -112,6 +112,19 @@ float roughness_parameter(const Properties &props, const char *other, float fact
     return factor * value;
 }
 
+glints::NormalMap load_map(const Parameters &parameters) {
+    try {
+        return glints::NormalMap::load(parameters.filename, parameters.encoding, parameters.flip_y);
+    } catch (const glints::Error &e) {
+        Throw("%s: %s", parameters.plugin, e.what()); // names the parameter and the file
+    }
+}
+
+std::string described(const Properties &props) {
+    std::string plugin(props.plugin_name());
+    return props.id().empty() ? plugin : plugin + " \"" + std::string(props.id()) + "\"";
+}
+
 Parameters::Parameters(const Properties &props) : plugin(props.plugin_name()) {
     read_map(props);
     read_placement(props);
@@ -147,6 +160,7 @@ void Parameters::read_placement(const Properties &props) {
 
 void Parameters::read_surface(const Properties &props) {
     surface.alpha = props.get<float>("alpha", surface.alpha);
+    surface.distribution = glints::Distribution(choice_parameter(props, "distribution", {"beckmann", "ggx"}));
     surface.normalization = glints::Normalization(choice_parameter(props, "normalization", {"projected", "paper"}));
 }
 

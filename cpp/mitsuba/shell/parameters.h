@@ -3,6 +3,8 @@
 // Every message names the plugin and the parameter, and the file where there is one, and says what to do.
 #pragma once
 
+#include "registry.h"
+
 #include <glints/glints.h>
 #include <mitsuba/core/properties.h>
 #include <mitsuba/core/transform.h>
@@ -19,7 +21,7 @@ enum class Interface {
     Dielectric, ///< reflection at a dielectric, `int_ior` and `ext_ior`
 };
 
-struct Parameters {
+struct GLINTS_MITSUBA_API Parameters {
     explicit Parameters(const mitsuba::Properties &props);
 
     std::string plugin;
@@ -44,5 +46,11 @@ private:
     void read_material(const mitsuba::Properties &props);
     void read_dielectric(const mitsuba::Properties &props);
 };
+
+/// The normal map that the parameters name.
+GLINTS_MITSUBA_API glints::NormalMap load_map(const Parameters &parameters);
+
+/// A plugin and, if it has one, its name in the scene: `glints_ibm "flakes"`.
+GLINTS_MITSUBA_API std::string described(const mitsuba::Properties &props);
 
 } // namespace glints_mitsuba

@@ -14,13 +14,17 @@ use std::time::Instant;
 use glam::Vec3;
 use glints::brdf::{Brdf as Core, Masking};
 use glints::error::{Error, Result};
+use glints::flake_layer::{self, LayerMasking};
 use glints::flakes::{FlakeModel, Normalization};
+use glints::gtr::Gtr;
 use glints::methods::Method;
+use glints::methods::compact::CompactBinMap;
 use glints::methods::direct::Direct;
-use glints::methods::inverse_bin_map::{self, InverseBinMap};
+use glints::methods::inverse_bin_map::{self, Binning, InverseBinMap, SpecularBinMap, SpecularOptions};
 use glints::methods::unfiltered::{Interpolation, Unfiltered};
 use glints::methods::yan16::{self, Elements, Yan16};
-use glints::microfacet::Flake;
+use glints::microfacet::{Distribution, Flake};
+use glints::mip_map::MipMap;
 use glints::normal_map::{self, Encoding};
 
 #[cxx::bridge(namespace = "glints::bridge")]
@@ -71,7 +75,14 @@ mod ffi {
     }
 
     #[derive(Clone, Copy)]
+    enum FlakeDistribution {
+        Beckmann,
+        Ggx,
+    }
+
+    #[derive(Clone, Copy)]
     struct Surface {
+        distribution: FlakeDistribution,
         alpha: f32,
         projected: bool,
         masking: MaskingKind,
@@ -80,10 +91,56 @@ mod ffi {
     }
 
     #[derive(Clone, Copy)]
+    enum BinningKind {
+        Automatic,
+        Projected,
+        EqualSolidAngle,
+    }
+
+    #[derive(Clone, Copy)]
+    enum StructureKind {
+        Automatic,
+        Compact,
+        Paper,
+    }
+
+    /// Numbers of zero: the method's own.
+    #[derive(Clone, Copy)]
+    struct InverseBinMapOptions {
+        structure: StructureKind,
+        bins: u32,
+        leaf_size: u32,
+        binning: BinningKind,
+    }
+
+    #[derive(Clone, Copy)]
     struct Yan16Options {
         curved: bool,
         refinement: u32,
         footprint_sigma: f32,
+    }
+
+    #[derive(Clone, Copy)]
+    struct FlakeLayerOptions {
+        bins: u32,
+        leaf_size: u32,
+        /// Zero: the masking of the surface.
+        gtr_gamma: f32,
+        gtr_alpha: f32,
+        largest_sine: f32,
+    }
+
+    #[derive(Clone, Copy)]
+    enum Drawn {
+        Flake,
+        Gap,
+        Nothing,
+    }
+
+    #[derive(Clone, Copy)]
+    struct FlakeSample {
+        drawn: Drawn,
+        wo: Vector,
     }
 
     struct Statistics {
@@ -108,7 +165,7 @@ mod ffi {
         fn normal(self: &Map, column: i64, row: i64) -> Vector;
 
         type Brdf;
-        fn inverse_bin_map(map: &Map, surface: Surface, bins: u32, leaf_size: u32) -> Result<Box<Brdf>>;
+        fn inverse_bin_map(map: &Map, surface: Surface, options: InverseBinMapOptions) -> Result<Box<Brdf>>;
         fn direct(map: &Map, surface: Surface) -> Result<Box<Brdf>>;
         fn unfiltered(map: &Map, surface: Surface, bilinear: bool) -> Result<Box<Brdf>>;
         fn yan16(map: &Map, surface: Surface, options: Yan16Options) -> Result<Box<Brdf>>;
@@ -117,6 +174,22 @@ mod ffi {
         fn sample(self: &Brdf, footprint: Footprint, wi: Vector, u: [f32; 3]) -> Sample;
         fn ndf(self: &Brdf, footprint: Footprint, h: Vector) -> f32;
         fn statistics(self: &Brdf) -> Statistics;
+
+        type FlakeLayer;
+        /// `mask` names a file; empty: every texel holds a flake.
+        fn flake_layer(
+            map: &Map,
+            mask: &str,
+            surface: Surface,
+            options: FlakeLayerOptions,
+        ) -> Result<Box<FlakeLayer>>;
+        fn cover(self: &FlakeLayer, footprint: Footprint) -> f32;
+        #[cxx_name = "evaluate"]
+        fn evaluate_flakes(self: &FlakeLayer, footprint: Footprint, wi: Vector, wo: Vector) -> Evaluation;
+        #[cxx_name = "sample"]
+        fn sample_flakes(self: &FlakeLayer, footprint: Footprint, wi: Vector, u: [f32; 3]) -> FlakeSample;
+        #[cxx_name = "statistics"]
+        fn layer_statistics(self: &FlakeLayer) -> Statistics;
     }
 }
 
@@ -170,14 +243,89 @@ pub struct Brdf {
     build_seconds: f64,
 }
 
-fn inverse_bin_map(map: &Map, surface: ffi::Surface, bins: u32, leaf_size: u32) -> Result<Box<Brdf>> {
-    let options = inverse_bin_map::Options {
-        bins: (bins > 0).then_some(bins),
-        leaf_size: (leaf_size > 0).then_some(leaf_size),
-    };
+fn inverse_bin_map(
+    map: &Map,
+    surface: ffi::Surface,
+    options: ffi::InverseBinMapOptions,
+) -> Result<Box<Brdf>> {
     build(map, surface, || {
+        if is_compact(surface, options)? {
+            return Ok(Box::new(CompactBinMap::new(&map.0, flakes(surface)?)));
+        }
+        if surface.alpha == 0.0 {
+            let options = specular_options(surface, options)?;
+            return Ok(Box::new(SpecularBinMap::new(&map.0, options)?));
+        }
+        if options.binning == ffi::BinningKind::EqualSolidAngle {
+            return Err(Error::Parameter {
+                name: "binning",
+                value: "equal_solid_angle".into(),
+                reason: "is only for specular flakes, alpha = 0: rough ones need the neighbours of a bin at \
+                         constant offsets on the projected hemisphere; leave the parameter out"
+                    .into(),
+            });
+        }
+        let options = inverse_bin_map_options(options.bins, options.leaf_size);
         Ok(Box::new(InverseBinMap::new(&map.0, flakes(surface)?, options)?))
     })
+}
+
+/// Which structure is meant: the paper's where a parameter asks for it that only it has, else the compact one.
+fn is_compact(surface: ffi::Surface, options: ffi::InverseBinMapOptions) -> Result<bool> {
+    let asks_for_paper = [
+        (surface.alpha == 0.0, "alpha = 0"),
+        (options.bins > 0, "bins"),
+        (options.leaf_size > 0, "leaf_size"),
+        (options.binning != ffi::BinningKind::Automatic, "binning"),
+    ];
+    let asking = asks_for_paper
+        .iter()
+        .find(|(asks, _)| *asks)
+        .map(|(_, name)| *name);
+    match (options.structure, asking) {
+        (ffi::StructureKind::Paper, _) => Ok(false),
+        (ffi::StructureKind::Compact, Some(name)) => Err(Error::Parameter {
+            name: "structure",
+            value: "compact".into(),
+            reason: format!("has no {name}; leave {name} out, or take structure = paper"),
+        }),
+        (_, asking) => Ok(asking.is_none()),
+    }
+}
+
+fn specular_options(surface: ffi::Surface, options: ffi::InverseBinMapOptions) -> Result<SpecularOptions> {
+    if options.bins == 0 {
+        return Err(Error::Parameter {
+            name: "bins",
+            value: "0".into(),
+            reason: "specular flakes, alpha = 0, have no roughness to derive it from; give the bins per side, such as \
+                     127, or a roughness"
+                .into(),
+        });
+    }
+    if distribution(surface) != Distribution::Beckmann {
+        return Err(Error::Parameter {
+            name: "distribution",
+            value: "ggx".into(),
+            reason: "specular flakes, alpha = 0, have no microfacets; leave the parameter out".into(),
+        });
+    }
+    Ok(SpecularOptions {
+        bins: options.bins,
+        binning: match options.binning {
+            ffi::BinningKind::Projected => Binning::Projected,
+            _ => Binning::EqualSolidAngle,
+        },
+        leaf_size: (options.leaf_size > 0).then_some(options.leaf_size),
+        normalization: normalization(surface),
+    })
+}
+
+fn inverse_bin_map_options(bins: u32, leaf_size: u32) -> inverse_bin_map::Options {
+    inverse_bin_map::Options {
+        bins: (bins > 0).then_some(bins),
+        leaf_size: (leaf_size > 0).then_some(leaf_size),
+    }
 }
 
 fn direct(map: &Map, surface: ffi::Surface) -> Result<Box<Brdf>> {
@@ -211,7 +359,14 @@ fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result
                     .into(),
             });
         }
-        flakes(surface)?;
+        if flakes(surface)?.flake.kind() != Distribution::Beckmann {
+            return Err(Error::Parameter {
+                name: "distribution",
+                value: "ggx".into(),
+                reason: "the elements of this method are Gaussian, as beckmann flakes are; leave the parameter out"
+                    .into(),
+            });
+        }
         let elements = match (options.curved, options.refinement) {
             (false, _) => Elements::Flat,
             (true, 0) => Elements::Curved {
@@ -230,13 +385,24 @@ fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result
 
 fn flakes(surface: ffi::Surface) -> Result<FlakeModel> {
     Ok(FlakeModel {
-        flake: Flake::new(surface.alpha)?,
-        normalization: if surface.projected {
-            Normalization::Projected
-        } else {
-            Normalization::Paper
-        },
+        flake: Flake::new(distribution(surface), surface.alpha)?,
+        normalization: normalization(surface),
     })
+}
+
+fn distribution(surface: ffi::Surface) -> Distribution {
+    match surface.distribution {
+        ffi::FlakeDistribution::Ggx => Distribution::Ggx,
+        _ => Distribution::Beckmann,
+    }
+}
+
+fn normalization(surface: ffi::Surface) -> Normalization {
+    if surface.projected {
+        Normalization::Projected
+    } else {
+        Normalization::Paper
+    }
 }
 
 fn build(
@@ -314,6 +480,110 @@ impl Brdf {
             method: method.name().into(),
             alpha: self.alpha,
             structure_bytes: method.structure_bytes() as u64,
+            build_seconds: self.build_seconds,
+            bins: method.bins().unwrap_or(0),
+            refinement: method.refinement().unwrap_or(0),
+            masking_alpha_u,
+            masking_alpha_v,
+        }
+    }
+
+    fn footprint(&self, f: ffi::Footprint) -> glints::footprint::Footprint {
+        self.core.footprint(f.uv, f.duv_dx, f.duv_dy)
+    }
+}
+
+// ---- layers of flakes -------------------------------------------------------------------------------------------------------------
+
+/// A layer of flakes, and how long it took to build.
+pub struct FlakeLayer {
+    core: flake_layer::FlakeLayer,
+    alpha: f32,
+    build_seconds: f64,
+}
+
+fn flake_layer(
+    map: &Map,
+    mask: &str,
+    surface: ffi::Surface,
+    options: ffi::FlakeLayerOptions,
+) -> Result<Box<FlakeLayer>> {
+    guarded("filename", map.0.name(), || {
+        let mask = if mask.is_empty() {
+            None
+        } else {
+            Some(MipMap::load_binary(mask)?)
+        };
+        let bins = inverse_bin_map_options(options.bins, options.leaf_size);
+        let start = Instant::now();
+        let core = flake_layer::FlakeLayer::new(
+            &map.0,
+            mask,
+            layer_masking(surface, options)?,
+            options.largest_sine,
+            |map| Ok(Box::new(InverseBinMap::new(map, flakes(surface)?, bins)?)),
+        )?;
+        Ok(Box::new(FlakeLayer {
+            core,
+            alpha: surface.alpha,
+            build_seconds: start.elapsed().as_secs_f64(),
+        }))
+    })
+}
+
+fn layer_masking(surface: ffi::Surface, options: ffi::FlakeLayerOptions) -> Result<LayerMasking> {
+    if options.gtr_gamma != 0.0 {
+        return Ok(LayerMasking::Gtr(Gtr::new(options.gtr_gamma, options.gtr_alpha)?));
+    }
+    Ok(match surface.masking {
+        ffi::MaskingKind::Beckmann => LayerMasking::Beckmann,
+        ffi::MaskingKind::Explicit => LayerMasking::Explicit {
+            alpha_u: surface.masking_alpha_u,
+            alpha_v: surface.masking_alpha_v,
+        },
+        _ => LayerMasking::None,
+    })
+}
+
+impl FlakeLayer {
+    fn cover(&self, footprint: ffi::Footprint) -> f32 {
+        self.core.cover(&self.footprint(footprint))
+    }
+
+    fn evaluate_flakes(
+        &self,
+        footprint: ffi::Footprint,
+        wi: ffi::Vector,
+        wo: ffi::Vector,
+    ) -> ffi::Evaluation {
+        let e = self
+            .core
+            .evaluate(&self.footprint(footprint), from_ffi(wi), from_ffi(wo));
+        ffi::Evaluation {
+            value: e.value,
+            pdf: e.pdf,
+        }
+    }
+
+    fn sample_flakes(&self, footprint: ffi::Footprint, wi: ffi::Vector, u: [f32; 3]) -> ffi::FlakeSample {
+        let (drawn, wo) = match self.core.sample(&self.footprint(footprint), from_ffi(wi), u) {
+            flake_layer::Drawn::Flake(wo) => (ffi::Drawn::Flake, wo),
+            flake_layer::Drawn::Gap => (ffi::Drawn::Gap, Vec3::ZERO),
+            flake_layer::Drawn::Nothing => (ffi::Drawn::Nothing, Vec3::ZERO),
+        };
+        ffi::FlakeSample {
+            drawn,
+            wo: to_ffi(wo),
+        }
+    }
+
+    fn layer_statistics(&self) -> ffi::Statistics {
+        let (masking_alpha_u, masking_alpha_v) = self.core.masking_alphas();
+        let method = self.core.method();
+        ffi::Statistics {
+            method: method.name().into(),
+            alpha: self.alpha,
+            structure_bytes: self.core.structure_bytes() as u64,
             build_seconds: self.build_seconds,
             bins: method.bins().unwrap_or(0),
             refinement: method.refinement().unwrap_or(0),

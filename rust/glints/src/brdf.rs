@@ -11,7 +11,7 @@ use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
 use crate::methods::Method;
 use crate::microfacet::beckmann_g1;
-use crate::normal_map::NormalMap;
+use crate::normal_map::{NormalMap, SlopeCovariance};
 
 /// Shadowing and masking `G_x` of the whole map; a flake's own Smith term is always present.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -29,14 +29,14 @@ pub enum Masking {
 /// direction with azimuth phi, and `alpha(phi)^2` is twice the variance of the slopes along it (Heitz 2014,
 /// Section 5.3).
 #[derive(Clone, Copy, Debug)]
-struct SmithMasking {
+pub(crate) struct SmithMasking {
     xx: f32,
     xy: f32,
     yy: f32,
 }
 
 impl SmithMasking {
-    fn new(masking: Masking, map: &NormalMap) -> Result<Self> {
+    pub(crate) fn new(masking: Masking, map: &NormalMap) -> Result<Self> {
         let squared = |name, alpha: f32| {
             if alpha.is_finite() && alpha >= 0.0 {
                 Ok(alpha * alpha)
@@ -50,14 +50,7 @@ impl SmithMasking {
                 xy: 0.0,
                 yy: 0.0,
             },
-            Masking::Beckmann => {
-                let slopes = map.slope_covariance();
-                Self {
-                    xx: (2.0 * slopes.xx) as f32,
-                    xy: (2.0 * slopes.xy) as f32,
-                    yy: (2.0 * slopes.yy) as f32,
-                }
-            }
+            Masking::Beckmann => Self::of_slopes(map.slope_covariance()),
             Masking::Explicit { alpha_u, alpha_v } => Self {
                 xx: squared("masking_alpha_u", alpha_u)?,
                 xy: 0.0,
@@ -66,8 +59,22 @@ impl SmithMasking {
         })
     }
 
+    /// The term of a surface whose slopes have this covariance.
+    pub(crate) fn of_slopes(slopes: SlopeCovariance) -> Self {
+        Self {
+            xx: (2.0 * slopes.xx) as f32,
+            xy: (2.0 * slopes.xy) as f32,
+            yy: (2.0 * slopes.yy) as f32,
+        }
+    }
+
+    /// Roughness along u and v.
+    pub(crate) fn alphas(&self) -> (f32, f32) {
+        (self.xx.sqrt(), self.yy.sqrt())
+    }
+
     #[inline]
-    fn g1(&self, v: Vec3) -> f32 {
+    pub(crate) fn g1(&self, v: Vec3) -> f32 {
         let form = self.xx * v.x * v.x + 2.0 * self.xy * v.x * v.y + self.yy * v.y * v.y;
         beckmann_g1(form / (v.z * v.z))
     }
@@ -112,7 +119,7 @@ impl Brdf {
 
     /// Roughness of `G_x` along u and v.
     pub fn masking_alphas(&self) -> (f32, f32) {
-        (self.masking.xx.sqrt(), self.masking.yy.sqrt())
+        self.masking.alphas()
     }
 
     /// The footprint at `uv` with its partial derivatives, over this BRDF's map.
@@ -177,7 +184,7 @@ impl Brdf {
 /// sampler keeps its stratification over the lobe. The point of the footprint comes from a 64-bit hash (the
 /// finaliser of SplitMix64) of all bits of the three numbers: it changes with each of them, is independent of
 /// the lobe's number for a given one through the first number, and has no structure that an image could show.
-fn four_uniforms([u1, u2, u3]: [f32; 3]) -> [f32; 4] {
+pub(crate) fn four_uniforms([u1, u2, u3]: [f32; 3]) -> [f32; 4] {
     let word = |u: f32| u64::from(u.to_bits());
     let mut z = word(u1)
         .wrapping_mul(0x9e37_79b9_7f4a_7c15)
@@ -195,7 +202,7 @@ mod tests {
     use crate::flakes::{FlakeModel, Normalization};
     use crate::methods::direct::Direct;
     use crate::methods::inverse_bin_map::{InverseBinMap, Options};
-    use crate::microfacet::Flake;
+    use crate::microfacet::{Distribution, Flake};
     use approx::assert_relative_eq;
 
     fn wavy_map() -> NormalMap {
@@ -208,7 +215,7 @@ mod tests {
     fn brdfs(alpha: f32, masking: Masking) -> [Brdf; 2] {
         let map = wavy_map();
         let model = FlakeModel {
-            flake: Flake::new(alpha).unwrap(),
+            flake: Flake::new(Distribution::default(), alpha).unwrap(),
             normalization: Normalization::Projected,
         };
         let direct = Brdf::new(&map, masking, || Ok(Box::new(Direct::new(map.clone(), model))));
@@ -280,7 +287,7 @@ mod tests {
         let normals = [Vec3::Z];
         let map = NormalMap::from_normals("flat", 1, 1, &normals).unwrap();
         let model = FlakeModel {
-            flake: Flake::new(0.1).unwrap(),
+            flake: Flake::new(Distribution::default(), 0.1).unwrap(),
             normalization: Normalization::Projected,
         };
         let brdf = Brdf::new(&map, Masking::None, || {

@@ -151,6 +151,13 @@ impl Footprint {
         self.region.as_ref()
     }
 
+    /// The parallelogram, if it lies inside one period of the map.
+    pub fn single_part(&self) -> Option<&Parallelogram> {
+        self.region
+            .as_ref()
+            .filter(|region| region.is_within(DVec2::ZERO, self.size))
+    }
+
     /// Calls `visit` with every part of the footprint. Weights of texels are areas divided by
     /// [`Footprint::area`].
     pub fn for_each_part(&self, mut visit: impl FnMut(Part)) {
@@ -185,12 +192,20 @@ impl Footprint {
     /// The texel at a uniformly distributed point of the footprint: it is drawn with its weight as
     /// probability.
     pub fn sample_texel(&self, u: [f64; 2]) -> (u32, u32) {
+        self.sample_part(u).0
+    }
+
+    /// The same, and the part of the footprint that the texel lies in, in the coordinates of the map; `None` for
+    /// a point.
+    pub fn sample_part(&self, u: [f64; 2]) -> ((u32, u32), Option<Parallelogram>) {
         let Some(region) = &self.region else {
-            return self.texel;
+            return (self.texel, None);
         };
         let p = region.center + (u[0] - 0.5) * region.edges[0] + (u[1] - 0.5) * region.edges[1];
-        let wrap = |x: f64, side: f64| (x.rem_euclid(side) as u32).min(side as u32 - 1);
-        (wrap(p.x, self.size.x), wrap(p.y, self.size.y))
+        let tile = (p / self.size).floor();
+        let texel = |x: f64, side: f64| (x.rem_euclid(side) as u32).min(side as u32 - 1);
+        let texel = (texel(p.x, self.size.x), texel(p.y, self.size.y));
+        (texel, Some(region.moved(-tile * self.size)))
     }
 }
 
@@ -230,6 +245,11 @@ impl Parallelogram {
         self.area
     }
 
+    /// Edges in texels.
+    pub fn edges(&self) -> [DVec2; 2] {
+        self.edges
+    }
+
     /// Corner points in order around the parallelogram.
     pub fn corners(&self) -> [DVec2; 4] {
         self.corners_from_center().map(|p| self.center + p)
@@ -251,11 +271,17 @@ impl Parallelogram {
     }
 
     /// s and t at the centre of a box, and by how much they vary from there to its sides.
+    #[inline]
     fn slabs(&self, low: DVec2, high: DVec2) -> [(f64, f64); 2] {
         let d = 0.5 * (low + high) - self.center;
         let e = 0.5 * (high - low);
-        self.gradients
-            .map(|g| (g.dot(d), g.x.abs() * e.x + g.y.abs() * e.y))
+        let [s, t] = &self.gradients;
+        [(s.dot(d), s.abs().dot(e)), (t.dot(d), t.abs().dot(e))]
+    }
+
+    /// Gradients per texel of s and t, and their values at `point`.
+    pub fn slabs_at(&self, point: DVec2) -> [(DVec2, f64); 2] {
+        self.gradients.map(|g| (g, g.dot(point - self.center)))
     }
 
     /// How the box `[low, high]` lies to the parallelogram. `Cut` may be answered for a box that is just
@@ -321,11 +347,16 @@ impl Parallelogram {
 
     /// [`Parallelogram::spans`] over texels, cut to the map's `[0, width) x [0, height)`.
     pub fn texel_spans(&self, width: u32, height: u32) -> impl Iterator<Item = Span> + use<> {
+        self.spans_within((0, 0), (width, height))
+    }
+
+    /// [`Parallelogram::spans`] over texels, cut to the rectangle `[low, high)` of the map.
+    pub fn spans_within(&self, low: (u32, u32), high: (u32, u32)) -> impl Iterator<Item = Span> + use<> {
         let e = self.half_extents();
-        let first = (self.center.y - e.y).floor().max(0.0) as i64;
-        let last = (self.center.y + e.y).ceil().min(f64::from(height)) as i64;
-        let right = i64::from(width);
-        let cut = move |(x0, x1): (i64, i64)| (x0.clamp(0, right), x1.clamp(0, right));
+        let first = (self.center.y - e.y).floor().max(f64::from(low.1)) as i64;
+        let last = (self.center.y + e.y).ceil().min(f64::from(high.1)) as i64;
+        let (left, right) = (i64::from(low.0), i64::from(high.0));
+        let cut = move |(x0, x1): (i64, i64)| (x0.clamp(left, right), x1.clamp(left, right));
         let rows = Rows::new(self, DVec2::ONE);
         (first..last).map(move |row| {
             let span = rows.span(row);

@@ -11,10 +11,14 @@
 
 pub mod brdf;
 pub mod error;
+pub mod flake_layer;
+pub mod flake_map;
 pub mod flakes;
 pub mod footprint;
 pub mod gaussian_footprint;
+pub mod gtr;
 pub mod half_vector;
 pub mod methods;
 pub mod microfacet;
+pub mod mip_map;
 pub mod normal_map;

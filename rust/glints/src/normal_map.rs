@@ -21,7 +21,7 @@ use crate::error::{Error, Result};
 pub const MIN_Z: f32 = 1e-3;
 
 /// Most texels per side; texel indices must fit into 32 bits.
-const MAX_SIDE: u32 = 65_535;
+pub const MAX_SIDE: u32 = 65_535;
 
 /// Most bytes of a decoded image: 32K x 32K texels of three floats.
 const MAX_DECODED_BYTES: u64 = 12 << 30;
@@ -44,6 +44,7 @@ pub struct NormalMap {
     name: String,
     width: u32,
     height: u32,
+    encoding: Encoding,
     normals: Vec<Vec3>,
 }
 
@@ -73,11 +74,12 @@ impl NormalMap {
             });
         }
         let texels = image.into_rgb32f().into_raw();
-        let signed = match encoding {
-            Encoding::Automatic => is_float && texels.iter().any(|&c| c < 0.0),
-            Encoding::Unsigned => false,
-            Encoding::Signed => true,
+        let encoding = match encoding {
+            Encoding::Automatic if is_float && texels.iter().any(|&c| c < 0.0) => Encoding::Signed,
+            Encoding::Automatic => Encoding::Unsigned,
+            given => given,
         };
+        let signed = encoding == Encoding::Signed;
         let flip = if flip_y { -1.0 } else { 1.0 };
         let decode_component = |c: f32| if signed { c } else { 2.0 * c - 1.0 };
         let vectors = texels.chunks_exact(3).map(|c| {
@@ -89,7 +91,9 @@ impl NormalMap {
         });
         // An 8-bit "no normal" (128, 128, 128) decodes to length 0.007, not to zero.
         let min_length = if signed { 1e-6 } else { 1e-2 };
-        Self::from_vectors(path.display().to_string(), width, height, vectors, min_length)
+        let mut map = Self::from_vectors(path.display().to_string(), width, height, vectors, min_length)?;
+        map.encoding = encoding;
+        Ok(map)
     }
 
     /// Takes `width * height` vectors of any positive length; `name` stands for the file in errors.
@@ -138,6 +142,7 @@ impl NormalMap {
             name,
             width,
             height,
+            encoding: Encoding::Signed,
             normals,
         })
     }
@@ -153,6 +158,11 @@ impl NormalMap {
 
     pub fn height(&self) -> u32 {
         self.height
+    }
+
+    /// How the file stored its normals, never `Automatic`; `Signed` for a map that was not read from a file.
+    pub fn encoding(&self) -> Encoding {
+        self.encoding
     }
 
     /// Unit normals, row by row; `width * height` of them.
@@ -183,29 +193,34 @@ impl NormalMap {
 
     /// Covariance of the slopes over all texels, in double precision.
     pub fn slope_covariance(&self) -> SlopeCovariance {
-        let slope = |n: &Vec3| DVec2::new(f64::from(-n.x), f64::from(-n.y)) / f64::from(n.z);
-        let count = self.normals.len() as f64;
-        let mean = self.normals.iter().map(slope).sum::<DVec2>() / count;
-        let mut sum = SlopeCovariance {
-            xx: 0.0,
-            xy: 0.0,
-            yy: 0.0,
-        };
-        for normal in &self.normals {
-            let d = slope(normal) - mean;
-            sum.xx += d.x * d.x;
-            sum.xy += d.x * d.y;
-            sum.yy += d.y * d.y;
-        }
-        SlopeCovariance {
-            xx: sum.xx / count,
-            xy: sum.xy / count,
-            yy: sum.yy / count,
-        }
+        slope_covariance(&self.normals)
     }
 }
 
-fn decode(path: &Path) -> Result<DynamicImage> {
+/// Covariance of the slopes of unit normals, at least one, in double precision.
+pub(crate) fn slope_covariance(normals: &[Vec3]) -> SlopeCovariance {
+    let slope = |n: &Vec3| DVec2::new(f64::from(-n.x), f64::from(-n.y)) / f64::from(n.z);
+    let count = normals.len() as f64;
+    let mean = normals.iter().map(slope).sum::<DVec2>() / count;
+    let mut sum = SlopeCovariance {
+        xx: 0.0,
+        xy: 0.0,
+        yy: 0.0,
+    };
+    for normal in normals {
+        let d = slope(normal) - mean;
+        sum.xx += d.x * d.x;
+        sum.xy += d.x * d.y;
+        sum.yy += d.y * d.y;
+    }
+    SlopeCovariance {
+        xx: sum.xx / count,
+        xy: sum.xy / count,
+        yy: sum.yy / count,
+    }
+}
+
+pub(crate) fn decode(path: &Path) -> Result<DynamicImage> {
     let failed = |reason: String| Error::File {
         path: path.into(),
         reason,
@@ -290,6 +305,7 @@ mod tests {
             ImageBuffer::from_pixel(3, 2, texel).save(&file.0).unwrap();
             let map = NormalMap::load(&file.0, Encoding::Automatic, false).unwrap();
             assert_eq!((map.width(), map.height()), (3, 2));
+            assert_eq!(map.encoding(), Encoding::Unsigned);
             assert!(
                 map.normal(2, 1)
                     .abs_diff_eq(Vec3::new(1.0, -1.0, 1.0).normalize(), 1e-6)
@@ -304,6 +320,7 @@ mod tests {
         let file = write_floats("signed.exr", [[-0.6, 0.0, 0.8], [0.0, 0.0, 1.0]]);
         let map = NormalMap::load(&file.0, Encoding::Automatic, false).unwrap();
         assert!(map.normal(0, 0).abs_diff_eq(Vec3::new(-0.6, 0.0, 0.8), 1e-6));
+        assert_eq!(map.encoding(), Encoding::Signed);
         let file = write_floats("positive.exr", [[0.2, 0.5, 0.9], [0.5, 0.5, 1.0]]);
         let map = NormalMap::load(&file.0, Encoding::Automatic, false).unwrap();
         assert!(map.normal(0, 0).abs_diff_eq(Vec3::new(-0.6, 0.0, 0.8), 1e-6));

@@ -7,17 +7,28 @@ use glints::flakes::{FlakeModel, Normalization};
 use glints::footprint::Footprint;
 use glints::half_vector::DirectionPair;
 use glints::methods::Method;
+use glints::methods::compact::CompactBinMap;
 use glints::methods::direct::Direct;
-use glints::methods::inverse_bin_map::{InverseBinMap, Options, bins};
+use glints::methods::inverse_bin_map::cells::Cells;
+use glints::methods::inverse_bin_map::{
+    Binning, InverseBinMap, Options, SpecularBinMap, SpecularOptions, bins,
+};
 use glints::methods::unfiltered::{Interpolation, Unfiltered};
 use glints::methods::yan16::{self, Elements, Yan16};
-use glints::microfacet::Flake;
+use glints::microfacet::{Distribution, Flake};
 use glints::normal_map::NormalMap;
 
 fn model(alpha: f32, normalization: Normalization) -> FlakeModel {
     FlakeModel {
-        flake: Flake::new(alpha).unwrap(),
+        flake: Flake::new(Distribution::Beckmann, alpha).unwrap(),
         normalization,
+    }
+}
+
+fn ggx_model(alpha: f32) -> FlakeModel {
+    FlakeModel {
+        flake: Flake::new(Distribution::Ggx, alpha).unwrap(),
+        normalization: Normalization::Projected,
     }
 }
 
@@ -51,6 +62,7 @@ fn methods(map: &NormalMap, model: FlakeModel) -> Vec<Box<dyn Method>> {
     vec![
         Box::new(Direct::new(map.clone(), model)),
         Box::new(InverseBinMap::new(map, model, Options::default()).unwrap()),
+        Box::new(CompactBinMap::new(map, model)),
         Box::new(Unfiltered::new(map.clone(), model, Interpolation::Nearest)),
         Box::new(yan16(map, model.flake.alpha(), Elements::Flat)),
     ]
@@ -113,6 +125,56 @@ fn distributions_integrate_to_one_against_the_cosine() {
     }
 }
 
+/// The naive double-precision sum of `D_GGX(h, t)`, Eq. 33 of Walter et al. 2007, over a whole map.
+fn naive_ggx(map: &NormalMap, alpha: f64, h: Vec3) -> f64 {
+    let term = |t: &Vec3| {
+        let cos = h.as_dvec3().dot(t.as_dvec3());
+        let tan2 = 1.0 / (cos * cos) - 1.0;
+        let d = alpha.powi(2) / (std::f64::consts::PI * cos.powi(4) * (alpha.powi(2) + tan2).powi(2));
+        if cos > 0.0 { d / f64::from(t.z) } else { 0.0 }
+    };
+    map.normals().iter().map(term).sum::<f64>() / map.normals().len() as f64
+}
+
+#[test]
+fn the_direct_sum_of_ggx_flakes_is_the_naive_one() {
+    let map = gaussian_map(16, [0.4, 0.3], 7);
+    let direct = Direct::new(map.clone(), ggx_model(0.02));
+    let beckmann = Direct::new(map.clone(), model(0.02, Normalization::Projected));
+    let whole = Footprint::in_texels(16, 16, DVec2::splat(8.0), DVec2::X * 16.0, DVec2::Y * 16.0);
+    let (mut worst, mut twin) = (0.0_f64, 0.0_f64);
+    for h in disk(24).0 {
+        let expected = naive_ggx(&map, 0.02, h);
+        worst = worst.max((f64::from(direct.ndf(&whole, h)) / expected - 1.0).abs());
+        twin = twin.max((f64::from(beckmann.ndf(&whole, h)) / expected - 1.0).abs());
+    }
+    // Nothing of the tail is left out, however far from all normals.
+    assert!(worst < 1e-3, "{worst}");
+    assert!(twin > 0.9, "{twin}");
+}
+
+#[test]
+fn distributions_of_ggx_flakes_integrate_to_one_against_the_cosine() {
+    let map = gaussian_map(24, [0.4, 0.3], 1);
+    for alpha in [0.05, 0.1] {
+        let model = ggx_model(alpha);
+        let ibm = InverseBinMap::new(&map, model, Options::default()).unwrap();
+        let direct = Direct::new(map.clone(), model);
+        for method in [&ibm as &dyn Method, &direct] {
+            for width in [0.0, 9.0, 40.0] {
+                let (points, cell) = disk((8.0 / f64::from(alpha)) as usize);
+                let footprint = footprint(24, width);
+                let integral: f64 = points.map(|h| f64::from(method.ndf(&footprint, h))).sum::<f64>() * cell;
+                let name = method.name();
+                assert!(
+                    (integral - 1.0).abs() < 0.01,
+                    "{name} alpha {alpha} width {width}: {integral}"
+                );
+            }
+        }
+    }
+}
+
 /// Relative L1 difference of the distributions of normals over the half-vector disk, averaged over
 /// footprints.
 fn relative_l1(method: &dyn Method, exact: &dyn Method, width: f64, turns: usize) -> f64 {
@@ -137,7 +199,7 @@ fn binned_distribution_is_near_the_direct_one() {
     let direct = Direct::new(map.clone(), model);
     let ibm = InverseBinMap::new(&map, model, Options::default()).unwrap();
     let mut coarse = model;
-    coarse.flake = Flake::new(0.02).unwrap();
+    coarse.flake = Flake::new(Distribution::Beckmann, 0.02).unwrap();
     let shifted = Direct::new(map, coarse);
     // Separate lobes are displaced to their bins' centres, many overlapping ones blend.
     for (width, bound) in [(1.0, 0.36), (8.0, 0.33), (64.0, 0.15)] {
@@ -145,6 +207,60 @@ fn binned_distribution_is_near_the_direct_one() {
         assert!(error < bound, "width {width}: {error}");
         // The bounds tell the wrong roughness from the right one.
         assert!(relative_l1(&shifted, &direct, width, 2) > bound);
+    }
+}
+
+#[test]
+fn compact_distribution_is_the_direct_one() {
+    // Sorted blocks at 0.02, texels in the map's order at 0.05 and 0.16; from 64 texels on with counts.
+    let map = gaussian_map(64, [0.4, 0.3], 2);
+    for alpha in [0.02, 0.05, 0.16] {
+        let model = model(alpha, Normalization::Projected);
+        let direct = Direct::new(map.clone(), model);
+        let compact = CompactBinMap::new(&map, model);
+        for (width, bound) in [(0.3, 0.035), (8.0, 0.02), (64.0, 0.02), (130.0, 0.03)] {
+            let error = difference(&compact, &direct, &footprint(64, width));
+            assert!(error < bound, "alpha {alpha} width {width}: {error}");
+        }
+    }
+}
+
+/// Relative L1 difference of two distributions of normals, at half vectors drawn from each in turn.
+fn difference(a: &dyn Method, b: &dyn Method, footprint: &Footprint) -> f64 {
+    const SAMPLES: usize = 3000;
+    let mut random = Random(17);
+    let mut sum = 0.0;
+    for i in 0..SAMPLES {
+        let u = std::array::from_fn(|_| random.uniform());
+        if let Some(h) = [a, b][i % 2].sample(footprint, u) {
+            let drawn_with = 0.5 * (a.density(footprint, h) + b.density(footprint, h));
+            sum += f64::from((a.ndf(footprint, h) - b.ndf(footprint, h)).abs() * h.z / drawn_with);
+        }
+    }
+    sum / SAMPLES as f64
+}
+
+#[test]
+fn samples_of_the_compact_structure_have_their_density() {
+    let map = gaussian_map(100, [0.4, 0.3], 5);
+    for (alpha, oversampling) in [(0.02, 16), (0.05, 5), (0.16, 3)] {
+        let method = CompactBinMap::new(&map, model(alpha, Normalization::Projected));
+        for (kind, footprint) in footprints_of_all_kinds(100).iter().enumerate() {
+            if oversampling == 16 && ![0, 2, 3].contains(&kind) {
+                continue;
+            }
+            let test = |density: &dyn Fn(Vec3) -> f32| {
+                let window = [0..48, 0..48];
+                chi_square(&method, density, footprint, (48, window), oversampling)
+            };
+            let exact = test(&|h| method.density(footprint, h));
+            assert!(is_plausible(exact), "alpha {alpha} footprint {kind}: {exact:?}");
+            if kind == 2 {
+                // Without the cosine it is another density.
+                let twin = test(&|h| method.ndf(footprint, h));
+                assert!(!is_plausible(twin), "alpha {alpha}: {twin:?}");
+            }
+        }
     }
 }
 
@@ -235,11 +351,154 @@ fn samples_have_their_density() {
     }
 }
 
+fn specular(map: &NormalMap, bins: u32, binning: Binning, normalization: Normalization) -> SpecularBinMap {
+    let options = SpecularOptions {
+        bins,
+        binning,
+        leaf_size: None,
+        normalization,
+    };
+    SpecularBinMap::new(map, options).unwrap()
+}
+
+#[test]
+fn distributions_of_specular_flakes_integrate_to_one_against_the_cosine() {
+    // Slopes up to the horizon: bins at the rim, where the cosine varies most inside a bin.
+    let map = gaussian_map(64, [2.0, 1.0], 1);
+    for (binning, bins) in [(Binning::Projected, 15), (Binning::EqualSolidAngle, 16)] {
+        for width in [0.0, 9.0, 140.0] {
+            let footprint = footprint(64, width);
+            let integral = |normalization: Normalization| {
+                let method = specular(&map, bins, binning, normalization);
+                let (points, cell) = disk(480); // whole points a bin of either grid
+                points.map(|h| f64::from(method.ndf(&footprint, h))).sum::<f64>() * cell
+            };
+            let projected = integral(Normalization::Projected);
+            assert!(
+                (projected - 1.0).abs() < 0.01,
+                "{binning:?} width {width}: {projected}"
+            );
+            // The literal weights see a tilted texel under its projected area.
+            let paper = integral(Normalization::Paper);
+            assert!(paper < 0.95, "{binning:?} width {width}: {paper}");
+        }
+    }
+}
+
+#[test]
+fn samples_of_specular_flakes_have_their_density() {
+    // Over ninths of bins, in each of which the density is constant: integrals are exact.
+    const SAMPLES: usize = 400_000;
+    let map = gaussian_map(64, [0.8, 0.5], 3);
+    for (binning, bins) in [(Binning::Projected, 15), (Binning::EqualSolidAngle, 12)] {
+        let method = specular(&map, bins, binning, Normalization::Projected);
+        let fine = Cells::new(binning, 3 * bins).unwrap();
+        for width in [0.0, 2.0, 30.0] {
+            let footprint = footprint(64, width);
+            let side = 3 * bins;
+            let mut observed = vec![0.0; (side * side) as usize + 1];
+            let mut random = Random(9);
+            for _ in 0..SAMPLES {
+                let cell = method.sample(&footprint, std::array::from_fn(|_| random.uniform()));
+                let index = cell
+                    .map(|h| fine.bin(h))
+                    .map_or(side * side, |(x, y)| y * side + x);
+                observed[index as usize] += 1.0;
+            }
+            let plausible = |density: &dyn Fn(Vec3) -> f32| {
+                let expected = |i: u32| {
+                    let bin = (i % side, i / side);
+                    let center = fine.sample(bin, [0.5, 0.5]);
+                    center.map_or(0.0, |h| f64::from(density(h)) * fine.solid_angle(bin))
+                };
+                let mut expected: Vec<f64> = (0..side * side).map(|i| SAMPLES as f64 * expected(i)).collect();
+                expected.push(SAMPLES as f64 - expected.iter().sum::<f64>());
+                is_plausible(pooled_statistic(&expected, &observed))
+            };
+            assert!(
+                plausible(&|h| method.density(&footprint, h)),
+                "{binning:?} {width}"
+            );
+            // The distribution of normals is another density.
+            assert!(!plausible(&|h| method.ndf(&footprint, h)), "{binning:?} {width}");
+        }
+    }
+}
+
+#[test]
+fn specular_reflection_is_the_distribution_without_shadowing() {
+    let map = gaussian_map(16, [0.4, 0.4], 5);
+    let method = specular(&map, 12, Binning::EqualSolidAngle, Normalization::Paper);
+    let whole = Footprint::in_texels(16, 16, DVec2::splat(8.0), DVec2::X * 16.0, DVec2::Y * 16.0);
+    let mut random = Random(5);
+    for _ in 0..100 {
+        let mut direction = || Vec3::new(random.uniform() - 0.5, random.uniform() - 0.5, 0.2).normalize();
+        let pair = DirectionPair::new(direction(), direction()).unwrap();
+        let reflection = method.evaluate(&whole, &pair);
+        let bin = method.cells().bin(pair.half);
+        let count = map
+            .normals()
+            .iter()
+            .filter(|&&t| method.cells().bin(t) == bin)
+            .count();
+        let expected = count as f64 / 256.0 * 144.0 / std::f64::consts::TAU;
+        assert!((f64::from(reflection.value) - expected).abs() <= 1e-5 * expected);
+        assert_eq!(reflection.value, reflection.density);
+    }
+}
+
+#[test]
+fn samples_of_ggx_flakes_have_their_density() {
+    let map = gaussian_map(64, [0.4, 0.3], 3);
+    let model = ggx_model(0.06);
+    let ibm = InverseBinMap::new(&map, model, Options::default()).unwrap();
+    let direct = Direct::new(map.clone(), model);
+    let twin = Direct::new(map, self::model(0.06, Normalization::Projected));
+    let bins = ibm.grid().resolution() as usize;
+    for width in [0.0, 6.0] {
+        let footprint = footprint(64, width);
+        for method in [&ibm as &dyn Method, &direct] {
+            let density = |h| method.density(&footprint, h);
+            let result = chi_square(method, density, &footprint, (bins, [0..bins, 0..bins]), 12);
+            let name = method.name();
+            assert!(is_plausible(result), "{name} width {width}: {result:?}");
+        }
+        let density = |h| direct.density(&footprint, h);
+        let result = chi_square(&twin, density, &footprint, (bins, [0..bins, 0..bins]), 4);
+        assert!(!is_plausible(result), "Beckmann flakes width {width}: {result:?}");
+    }
+}
+
+#[test]
+fn energy_of_ggx_flakes_is_kept_at_every_tilt() {
+    let derived = bins::derived_resolution;
+    for (alpha, slope, bins) in [
+        (0.01, 0.0, derived(0.01)),
+        (0.01, 0.7, derived(0.01)),
+        (0.01, 2.0, derived(0.01)),
+        (0.1, 0.5, derived(0.1)),
+        (0.01, 0.3, derived(0.01) / 4),
+        (0.01, 0.3, derived(0.01) * 2),
+    ] {
+        let options = Options {
+            bins: Some(bins),
+            ..Options::default()
+        };
+        let (ibm, footprint, window) = one_flake(ggx_model(alpha), slope, options);
+        let points = (ibm.grid().width() / (0.1 * f64::from(alpha))).ceil() as usize + 8;
+        let integral = integral_over_window(&ibm, &footprint, &window, points);
+        assert!(
+            (integral - 1.0).abs() < 0.01,
+            "alpha {alpha} slope {slope} bins {bins}: {integral}"
+        );
+    }
+}
+
 /// A point, less than a texel, some texels, several repetitions of the map, an even cover of it, and thin
 /// ones: many periods, a line, a closed line on the repeated map.
-fn footprints_of_all_kinds() -> Vec<Footprint> {
+fn footprints_of_all_kinds(side: u32) -> Vec<Footprint> {
     let mut all: Vec<Footprint> = [0.0, 0.5, 9.0, 70.0, 300.0]
-        .map(|width| footprint(64, width))
+        .map(|width| footprint(side, width))
         .into();
     let slope = DVec2::new(1.0, 2.0).normalize();
     for (a, thickness) in [
@@ -248,7 +507,7 @@ fn footprints_of_all_kinds() -> Vec<Footprint> {
         (slope * 300.0, 1.0),
     ] {
         let b = a.normalize().perp() * thickness;
-        all.push(Footprint::in_texels(64, 64, DVec2::new(20.7, 41.2), a, b));
+        all.push(Footprint::in_texels(side, side, DVec2::new(20.7, 41.2), a, b));
     }
     all
 }
@@ -259,7 +518,7 @@ fn samples_of_position_normal_mixtures_have_their_density() {
     let refined = Elements::Curved { refinement: 2 };
     for elements in [Elements::Flat, Elements::Curved { refinement: 1 }, refined] {
         let method = yan16(&map, 0.05, elements);
-        for (kind, footprint) in footprints_of_all_kinds().iter().enumerate() {
+        for (kind, footprint) in footprints_of_all_kinds(64).iter().enumerate() {
             let grid = || (48, [0..48, 0..48]);
             let exact = chi_square(&method, |h| method.density(footprint, h), footprint, grid(), 5);
             assert!(
@@ -285,7 +544,7 @@ fn position_normal_mixtures_are_normalized() {
             refinement => Elements::Curved { refinement },
         };
         let method = yan16(&map, 0.05, elements);
-        for (kind, footprint) in footprints_of_all_kinds().iter().enumerate() {
+        for (kind, footprint) in footprints_of_all_kinds(64).iter().enumerate() {
             let (points, cell) = disk(160);
             let integral: f64 = points.map(|h| f64::from(method.ndf(footprint, h))).sum::<f64>() * cell;
             let name = method.name();
@@ -298,10 +557,14 @@ fn position_normal_mixtures_are_normalized() {
 }
 
 /// A map of one texel with the given slope, and the 7 x 7 bins around its normal.
-fn one_flake(slope: f32, alpha: f32, options: Options) -> (InverseBinMap, Footprint, [Range<usize>; 2]) {
+fn one_flake(
+    model: FlakeModel,
+    slope: f32,
+    options: Options,
+) -> (InverseBinMap, Footprint, [Range<usize>; 2]) {
     let normals = [Vec3::new(-slope, 0.3 * slope, 1.0)];
     let map = NormalMap::from_normals("flake", 1, 1, &normals).unwrap();
-    let ibm = InverseBinMap::new(&map, model(alpha, Normalization::Projected), options).unwrap();
+    let ibm = InverseBinMap::new(&map, model, options).unwrap();
     let (column, row) = ibm.grid().bin(map.normal(0, 0));
     let bins = ibm.grid().resolution() as usize;
     let around = |k: u32| (k as usize).saturating_sub(3)..(k as usize + 4).min(bins);
@@ -313,7 +576,8 @@ fn one_flake(slope: f32, alpha: f32, options: Options) -> (InverseBinMap, Footpr
 fn samples_of_nearly_specular_flakes_have_their_density() {
     for alpha in [0.0025, 0.01] {
         for slope in [0.0, 0.7] {
-            let (ibm, footprint, window) = one_flake(slope, alpha, Options::default());
+            let (ibm, footprint, window) =
+                one_flake(model(alpha, Normalization::Projected), slope, Options::default());
             let grid = (ibm.grid().resolution() as usize, window);
             let result = chi_square(&ibm, |h| ibm.density(&footprint, h), &footprint, grid, 24);
             assert!(is_plausible(result), "alpha {alpha} slope {slope}: {result:?}");
@@ -372,7 +636,7 @@ fn energy_is_kept_at_the_rim_and_with_coarse_or_fine_bins() {
             bins: Some(resolution),
             ..Options::default()
         };
-        let (ibm, footprint, window) = one_flake(slope, alpha, options);
+        let (ibm, footprint, window) = one_flake(model(alpha, Normalization::Projected), slope, options);
         // A fifth of the lobe's width on the disk, which its tilt narrows.
         let tilt = 1.0 / (1.0 + 1.1 * f64::from(slope * slope)).sqrt();
         let points = (ibm.grid().width() / (0.2 * f64::from(alpha) * tilt)).ceil() as usize + 2;

@@ -1,5 +1,6 @@
 //! One module per published method; each answers the three questions of [`Method`] over a footprint.
 
+pub mod compact;
 pub mod direct;
 pub mod inverse_bin_map;
 pub mod unfiltered;

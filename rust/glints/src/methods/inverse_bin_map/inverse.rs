@@ -114,8 +114,26 @@ impl InverseMap {
 
     /// Adds to each slot the area of its bin's texels inside `region`.
     pub fn add_areas(&self, region: &Parallelogram, bins: &Neighbourhood, areas: &mut [f64; SLOTS]) {
+        self.add_areas_of(region, bins.bins(), areas);
+    }
+
+    /// The area of one bin's texels inside `region`.
+    pub fn area(&self, region: &Parallelogram, bin: Bin) -> f64 {
+        let mut areas = [0.0; SLOTS];
+        self.add_areas_of(region, std::iter::once((0, bin)), &mut areas);
+        areas[0]
+    }
+
+    /// `bins`: at most [`SLOTS`] different slots with their bins.
+    #[inline]
+    fn add_areas_of(
+        &self,
+        region: &Parallelogram,
+        bins: impl Iterator<Item = (usize, Bin)>,
+        areas: &mut [f64; SLOTS],
+    ) {
         let mut nodes = Nodes::new();
-        for (slot, bin) in bins.bins() {
+        for (slot, bin) in bins {
             let j = self.bin_index(bin);
             let count = self.starts[j + 1] - self.starts[j];
             let node = Node {

@@ -1,12 +1,12 @@
 use super::*;
 use crate::flakes::Normalization;
 use crate::methods::direct::Direct;
-use crate::microfacet::Flake;
+use crate::microfacet::{Distribution, Flake};
 use glam::DVec2;
 use proptest::prelude::*;
 
 /// A reproducible map of random normals with slopes up to `steepness`.
-fn random_map(width: u32, height: u32, steepness: f32, seed: u64) -> NormalMap {
+pub(super) fn random_map(width: u32, height: u32, steepness: f32, seed: u64) -> NormalMap {
     let mut state = seed;
     let mut uniform = || {
         state = state
@@ -25,7 +25,7 @@ fn random_map(width: u32, height: u32, steepness: f32, seed: u64) -> NormalMap {
 
 fn model(alpha: f32) -> FlakeModel {
     FlakeModel {
-        flake: Flake::new(alpha).unwrap(),
+        flake: Flake::new(Distribution::default(), alpha).unwrap(),
         normalization: Normalization::Projected,
     }
 }

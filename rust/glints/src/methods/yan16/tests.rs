@@ -3,7 +3,7 @@ use super::*;
 use crate::flakes::{FlakeModel, Normalization};
 use crate::gaussian_footprint::Symmetric;
 use crate::methods::direct::Direct;
-use crate::microfacet::Flake;
+use crate::microfacet::{Distribution, Flake};
 use approx::assert_relative_eq;
 
 const FLAT: Elements = Elements::Flat;
@@ -131,7 +131,7 @@ fn flat_elements_under_a_wide_footprint_agree_with_the_direct_sum() {
     let intrinsic = 0.03;
     let yan = build(&map, FLAT, intrinsic);
     let model = FlakeModel {
-        flake: Flake::new(intrinsic * std::f32::consts::SQRT_2).unwrap(),
+        flake: Flake::new(Distribution::default(), intrinsic * std::f32::consts::SQRT_2).unwrap(),
         normalization: Normalization::Projected,
     };
     let direct = Direct::new(map.clone(), model);

@@ -1,0 +1,303 @@
+//! `glints ndf`: pictures of filtered distributions of normals.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use glam::DVec2;
+use glints::flakes::FlakeModel;
+use glints::footprint::Footprint;
+use glints::methods::Method;
+use glints::methods::direct::Direct;
+use glints::methods::unfiltered::{Interpolation, Unfiltered};
+use glints::methods::yan16::{self, Elements, Yan16};
+use glints::normal_map::NormalMap;
+use serde_json::{Value, json};
+
+use crate::arguments::{Distribution, FlakeArguments, MapArguments, decimal};
+use crate::failure::{Failure, Result};
+use crate::output::{self, Destination};
+use crate::picture::{self, DECADES, Format};
+use crate::progress::Progress;
+use crate::quadrature::{Estimate, Problem};
+use crate::structures;
+
+/// Picture of the distribution of normals that a pixel sees, filtered over its footprint
+///
+/// The disk is the hemisphere seen from above: its centre is the shading normal, its rim the horizon, x points
+/// right along u and y up along v. The brightness at a point is the density of flakes that mirror there, per
+/// steradian: where the half vector of eye and light falls on a bright spot, the pixel glints. Every pixel of
+/// the picture is an average over its area.
+///
+/// PNG pictures have colours on a logarithmic scale of five powers of ten that ends at the peak (the bar at the
+/// right has a notch at each); EXR pictures have the values. What is printed tells peak, mean and integral.
+///
+/// Example: glints ndf flakes.exr --at 0.3,0.6 --footprint 32 --method ibm --compare direct -o ndf.png
+#[derive(Args)]
+#[command(verbatim_doc_comment)]
+pub struct Arguments {
+    #[command(flatten)]
+    map: MapArguments,
+
+    /// Where on the map the footprint's centre is, in periods of the map
+    #[arg(long, value_name = "U,V", value_parser = parse_numbers::<2>, default_value = "0.5,0.5", allow_hyphen_values = true)]
+    at: [f64; 2],
+
+    /// Footprint of the pixel, in texels: one width, `DU,DV` of a box along the axes, or the two edges
+    /// `AU,AV,BU,BV` of a parallelogram; 0 is a point
+    #[arg(long, value_name = "TEXELS", value_parser = parse_footprint, allow_hyphen_values = true)]
+    footprint: [DVec2; 2],
+
+    /// How the footprint is filtered
+    #[arg(long, value_enum, default_value_t)]
+    method: MethodName,
+
+    #[command(flatten)]
+    flake: FlakeArguments,
+
+    /// Pixels per side of the picture, in 16 to 4096
+    #[arg(long, value_name = "PIXELS", default_value_t = 512, value_parser = clap::value_parser!(u32).range(16..=4096))]
+    size: u32,
+
+    /// Put this method's picture to the right, and tell the difference
+    #[arg(long, value_enum, value_name = "METHOD")]
+    compare: Option<MethodName>,
+
+    /// Most points at which the distribution is evaluated: a grid where it resolves the lobes, else draws
+    #[arg(long, default_value_t = 16_000_000, value_parser = clap::value_parser!(u64).range(65_536..=100_000_000_000))]
+    points: u64,
+
+    /// Picture to write: .png (colours) or .exr (values)
+    #[arg(short, long, value_name = "PICTURE")]
+    output: PathBuf,
+
+    /// Overwrite the picture if it exists
+    #[arg(long)]
+    force: bool,
+
+    /// Print one line of JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[value(rename_all = "snake_case")]
+enum MethodName {
+    /// The exact sum over the texels
+    #[default]
+    Direct,
+    /// Inverse bin map, in the structure of this project
+    Ibm,
+    /// Inverse bin map, in the structure as published
+    IbmPaper,
+    /// Position-normal mixture of flat elements (Yan et al. 2016)
+    Yan16,
+    /// The same with curved elements: the interpolated map
+    Yan16Curved,
+    /// The one texel under the point
+    Unfiltered,
+}
+
+impl MethodName {
+    fn build(self, map: &NormalMap, model: FlakeModel) -> Result<Box<dyn Method>> {
+        let _progress = Progress::spinner("building the structure");
+        let mixture = |elements| -> Result<Box<dyn Method>> {
+            let options = yan16::Options {
+                elements,
+                intrinsic: model.flake.alpha() / std::f32::consts::SQRT_2,
+                ..yan16::Options::default()
+            };
+            Ok(Box::new(Yan16::new(map, options)?))
+        };
+        Ok(match self {
+            Self::Direct => Box::new(Direct::new(map.clone(), model)),
+            Self::Ibm => Box::new(structures::ibm(map, model)),
+            Self::IbmPaper => structures::ibm_paper(map, model)?,
+            Self::Yan16 => mixture(Elements::Flat)?,
+            Self::Yan16Curved => mixture(Elements::Curved {
+                refinement: yan16::resolving_refinement(map),
+            })?,
+            Self::Unfiltered => Box::new(Unfiltered::new(map.clone(), model, Interpolation::Nearest)),
+        })
+    }
+
+    /// Methods whose elements are Gaussians have no other flakes.
+    fn check(self, distribution: Distribution) -> Result<()> {
+        if matches!(self, Self::Yan16 | Self::Yan16Curved) && distribution != Distribution::Beckmann {
+            return Err(Failure::usage(format!(
+                "parameter \"distribution\" = {}: {} is a mixture of Gaussians; leave the parameter out or take \
+                 another method",
+                name_of(distribution),
+                name_of(self)
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// The name under which a value is given.
+fn name_of(value: impl ValueEnum) -> String {
+    value
+        .to_possible_value()
+        .map_or_else(String::new, |v| v.get_name().to_string())
+}
+
+/// `COUNT` finite numbers, separated by commas.
+fn parse_numbers<const COUNT: usize>(text: &str) -> std::result::Result<[f64; COUNT], String> {
+    let numbers = numbers(text)?;
+    numbers
+        .try_into()
+        .map_err(|_| format!("{COUNT} numbers with commas between them are needed"))
+}
+
+fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
+    let number = |part: &str| match part.trim().parse::<f64>() {
+        Ok(number) if number.is_finite() => Ok(number),
+        _ => Err(format!("\"{part}\" is not a finite number")),
+    };
+    text.split(',').map(number).collect()
+}
+
+/// Edges of the parallelogram, in texels.
+fn parse_footprint(text: &str) -> std::result::Result<[DVec2; 2], String> {
+    let numbers = numbers(text)?;
+    if numbers.len() < 3 && numbers.iter().any(|&width| width < 0.0) {
+        return Err("a width must not be negative".into());
+    }
+    match numbers[..] {
+        [width] => Ok([DVec2::new(width, 0.0), DVec2::new(0.0, width)]),
+        [du, dv] => Ok([DVec2::new(du, 0.0), DVec2::new(0.0, dv)]),
+        [au, av, bu, bv] => Ok([DVec2::new(au, av), DVec2::new(bu, bv)]),
+        _ => Err("one width, the two of a box, or the four numbers of a parallelogram are needed".into()),
+    }
+}
+
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let format = Format::of(&arguments.output)?;
+    for method in std::iter::once(arguments.method).chain(arguments.compare) {
+        method.check(arguments.flake.distribution)?;
+    }
+    let destination = Destination::new(&arguments.output, arguments.force, &[&arguments.map.map])?;
+    let model = arguments.flake.model()?;
+    let map = arguments.map.load()?;
+    let method = arguments.method.build(&map, model)?;
+    let compare = match arguments.compare {
+        Some(name) => Some(name.build(&map, model)?),
+        None => None,
+    };
+    let footprint = footprint(arguments, &map);
+    drop(map);
+    let problem = Problem {
+        method: method.as_ref(),
+        compare: compare.as_deref(),
+        footprint,
+        lobe: f64::from(model.flake.alpha()) / std::f64::consts::SQRT_2,
+        size: arguments.size,
+        points: arguments.points,
+    };
+    let estimate = problem.solve();
+    let peak = write(&destination, format, arguments.size, &estimate)?;
+    let report = report(arguments, &footprint, &estimate, peak);
+    output::print(&if arguments.json {
+        format!("{report}\n")
+    } else {
+        text(&report)
+    })
+}
+
+fn footprint(arguments: &Arguments, map: &NormalMap) -> Footprint {
+    let size = DVec2::new(f64::from(map.width()), f64::from(map.height()));
+    // Whole periods go in double precision: they change nothing.
+    let center = DVec2::from(arguments.at.map(|x| x.rem_euclid(1.0))) * size;
+    let [a, b] = arguments.footprint;
+    Footprint::in_texels(map.width(), map.height(), center, a, b)
+}
+
+/// The common peak of the scale.
+fn write(destination: &Destination, format: Format, size: u32, estimate: &Estimate) -> Result<f32> {
+    let panels: Vec<&[f32]> = estimate.pictures.iter().map(|p| p.pixels.as_slice()).collect();
+    let peak = estimate.pictures.iter().map(|p| p.peak()).fold(0.0, f32::max);
+    if peak <= 0.0 {
+        let reason = "nothing to show: no flake of the footprint has a lobe on the disk that the points met; \
+                      give more --points";
+        return Err(Failure::file(destination.path(), reason));
+    }
+    output::write_files(&[destination], |files| {
+        picture::write(&files[0], format, &panels, size, peak)
+    })?;
+    Ok(peak)
+}
+
+fn report(arguments: &Arguments, footprint: &Footprint, estimate: &Estimate, peak: f32) -> Value {
+    let pictures: Vec<Value> = [Some(arguments.method), arguments.compare]
+        .into_iter()
+        .flatten()
+        .zip(&estimate.pictures)
+        .map(|(name, picture)| {
+            json!({
+                "method": name_of(name),
+                "peak": picture.peak(),
+                "mean": picture.mean(),
+                "integral": picture.integral,
+                "error": picture.error,
+            })
+        })
+        .collect();
+    json!({
+        "output": arguments.output.display().to_string(),
+        "center_texels": footprint.center().to_array(),
+        "footprint_texels": footprint.edges().map(|edge| edge.to_array()),
+        "alpha": decimal(arguments.flake.alpha),
+        "distribution": name_of(arguments.flake.distribution),
+        "size": arguments.size,
+        "scale": [peak / 10_f32.powf(DECADES), peak],
+        "strategy": estimate.strategy,
+        "points": estimate.points,
+        "pictures": pictures,
+        "relative_l1_difference": estimate.difference,
+    })
+}
+
+fn text(report: &Value) -> String {
+    let number = |value: &Value| format!("{:.4}", value.as_f64().unwrap_or(f64::NAN));
+    let scientific = |value: &Value| format!("{:.3e}", value.as_f64().unwrap_or(f64::NAN));
+    let mut text = format!(
+        "scale of colours  {} to {} per steradian, logarithmic\npoints            {} ({})\n",
+        scientific(&report["scale"][0]),
+        scientific(&report["scale"][1]),
+        report["points"],
+        report["strategy"].as_str().unwrap_or_default()
+    );
+    for picture in report["pictures"].as_array().into_iter().flatten() {
+        text += &format!(
+            "{:<17} peak {}, mean {}, integral against the cosine {}, relative L1 error of the pixels below {}\n",
+            picture["method"].as_str().unwrap_or_default(),
+            scientific(&picture["peak"]),
+            number(&picture["mean"]),
+            number(&picture["integral"]),
+            scientific(&picture["error"]),
+        );
+    }
+    if !report["relative_l1_difference"].is_null() {
+        text += &format!(
+            "difference        {} relative L1, point by point\n",
+            number(&report["relative_l1_difference"])
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn footprints_have_one_two_or_four_numbers() {
+        let edges = |text| parse_footprint(text).map(|[a, b]| [a.to_array(), b.to_array()]);
+        assert_eq!(edges("3"), Ok([[3.0, 0.0], [0.0, 3.0]]));
+        assert_eq!(edges("3, 4"), Ok([[3.0, 0.0], [0.0, 4.0]]));
+        assert_eq!(edges("1,-2,3,4"), Ok([[1.0, -2.0], [3.0, 4.0]]));
+        for wrong in ["", "a", "1,2,3", "-1", "inf", "nan", "1,2,3,4,5"] {
+            assert!(edges(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,458 @@
+//! The tool as a process: results, messages, exit status, and what it leaves on the disk.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+fn glints(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_glints"))
+        .args(arguments)
+        .current_dir(folder)
+        .output()
+        .unwrap()
+}
+
+fn succeeds(folder: &Path, arguments: &[&str]) -> String {
+    let output = glints(folder, arguments);
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {message}");
+    assert!(message.is_empty(), "{arguments:?}: {message}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn json(folder: &Path, arguments: &[&str]) -> Value {
+    serde_json::from_str(&succeeds(folder, arguments)).unwrap()
+}
+
+/// The one line of a failure, which has all of `words`, and nothing on standard output.
+fn fails(folder: &Path, arguments: &[&str], status: i32, words: &[&str]) {
+    let output = glints(folder, arguments);
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(status), "{arguments:?}: {message}");
+    assert_eq!(message.lines().count(), 1, "{arguments:?}: {message}");
+    assert!(output.stdout.is_empty(), "{arguments:?}");
+    for word in words {
+        assert!(
+            message.contains(word),
+            "{arguments:?}: {word:?} is not in {message}"
+        );
+    }
+}
+
+/// A folder with a flake map of 128 x 128 texels, `flakes.exr`.
+fn folder_with_map() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let options = [
+        "--size",
+        "128",
+        "--flake-size",
+        "3",
+        "--gamma",
+        "3",
+        "--alpha",
+        "0.2",
+    ];
+    let arguments = [
+        &["flakes", "-o", "flakes.exr", "--mask", "mask.png"],
+        &options[..],
+    ]
+    .concat();
+    succeeds(folder.path(), &arguments);
+    folder
+}
+
+fn files(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> = std::fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    names
+}
+
+fn ndf(folder: &Path, more: &[&str]) -> Value {
+    let common = ["ndf", "flakes.exr", "--force", "--json"];
+    json(folder, &[&common, more].concat())
+}
+
+fn number(value: &Value) -> f64 {
+    value
+        .as_f64()
+        .unwrap_or_else(|| panic!("{value} is not a number"))
+}
+
+#[test]
+fn help_teaches_every_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let help = succeeds(folder.path(), &["--help"]);
+    for command in ["info", "ndf", "precompute", "flakes"] {
+        assert!(help.contains(command), "{help}");
+    }
+    for command in [&["info"][..], &["ndf"], &["precompute", "ibm"], &["flakes"]] {
+        let help = succeeds(folder.path(), &[command, &["--help"]].concat());
+        assert!(help.contains("Example: glints "), "{help}");
+    }
+}
+
+#[test]
+fn info_tells_what_a_flake_map_holds() {
+    let folder = folder_with_map();
+    let report = json(
+        folder.path(),
+        &["info", "flakes.exr", "--alpha", "0.0025,0.16", "--json"],
+    );
+    assert_eq!(report["width"], 128);
+    assert_eq!(report["encoding"], "signed");
+    assert_eq!(report["tiling"]["tiles"], true);
+    // The texels without a flake, 0.4 of the area.
+    let flat = number(&report["flat_texels"]);
+    assert!((0.35..0.45).contains(&flat), "{flat}");
+    assert_eq!(report["structures"].as_array().unwrap().len(), 2);
+    assert_eq!(report["structures"][0]["alpha"], 0.0025);
+    assert!(number(&report["structures"][0]["bytes"]) > 0.0);
+    let text = succeeds(folder.path(), &["info", "flakes.exr"]);
+    assert!(text.contains("128 x 128 texels, signed"), "{text}");
+}
+
+#[test]
+fn every_method_shows_a_distribution_that_integrates_to_one() {
+    let folder = folder_with_map();
+    for method in [
+        "direct",
+        "ibm",
+        "ibm_paper",
+        "yan16",
+        "yan16_curved",
+        "unfiltered",
+    ] {
+        let options = [
+            "--footprint",
+            "9,5",
+            "--alpha",
+            "0.08",
+            "--size",
+            "64",
+            "-o",
+            "ndf.exr",
+        ];
+        let report = ndf(folder.path(), &[&["--method", method], &options[..]].concat());
+        let picture = &report["pictures"][0];
+        assert_eq!(report["strategy"], "grid");
+        assert_eq!(picture["method"], method);
+        let integral = number(&picture["integral"]);
+        assert!((integral - 1.0).abs() < 0.01, "{method}: {integral}");
+    }
+}
+
+#[test]
+fn lobes_far_narrower_than_a_pixel_keep_their_energy() {
+    let folder = folder_with_map();
+    let options = [
+        "--footprint",
+        "0",
+        "--alpha",
+        "0.0002",
+        "-o",
+        "ndf.exr",
+        "--points",
+        "65536",
+    ];
+    let report = ndf(folder.path(), &options);
+    assert_eq!(report["strategy"], "draws");
+    let picture = &report["pictures"][0];
+    assert!((number(&picture["integral"]) - 1.0).abs() < 0.01, "{picture}");
+    // One lobe lies in one pixel, or in four at most.
+    let whole = (64.0_f64 / 2.0).powi(2);
+    assert!(number(&picture["peak"]) > 0.24 * whole, "{picture}");
+}
+
+#[test]
+fn grid_and_draws_agree() {
+    let folder = folder_with_map();
+    let options = [
+        "--footprint",
+        "20",
+        "--alpha",
+        "0.05",
+        "-o",
+        "ndf.exr",
+        "--compare",
+        "ibm_paper",
+    ];
+    let grid = ndf(folder.path(), &options);
+    let draws = ndf(
+        folder.path(),
+        &[&options[..], &["--size", "256", "--points", "65536"]].concat(),
+    );
+    assert_eq!(
+        (&grid["strategy"], &draws["strategy"]),
+        (&"grid".into(), &"draws".into())
+    );
+    let [a, b] = [grid, draws].map(|report| number(&report["relative_l1_difference"]));
+    assert!(a > 0.02 && (a / b - 1.0).abs() < 0.05, "{a} {b}");
+}
+
+#[test]
+fn pictures_hold_the_values_and_their_place() {
+    let folder = folder_with_map();
+    // The flake under the point, as `unfiltered` sees it, is one lobe about its normal.
+    let at = [
+        "--at",
+        "0.3,0.6",
+        "--footprint",
+        "0",
+        "--alpha",
+        "0.05",
+        "--size",
+        "64",
+    ];
+    for name in ["ndf.exr", "ndf.png"] {
+        ndf(folder.path(), &[&at[..], &["-o", name]].concat());
+    }
+    let map = image::open(folder.path().join("flakes.exr"))
+        .unwrap()
+        .into_rgb32f();
+    let normal = map.get_pixel((0.3 * 128.0) as u32, (0.6 * 128.0) as u32).0;
+    let picture = image::open(folder.path().join("ndf.exr")).unwrap().into_rgb32f();
+    assert_eq!(picture.dimensions(), (64, 64));
+    let (mut sum, mut center) = (0.0, [0.0; 2]);
+    for (x, y, value) in picture.enumerate_pixels() {
+        let position = |i: u32| f64::from(i) / 32.0 + 1.0 / 64.0 - 1.0;
+        let mass = f64::from(value.0[0]) / (32.0 * 32.0);
+        sum += mass;
+        center[0] += mass * position(x);
+        center[1] -= mass * position(y);
+    }
+    assert!((sum - 1.0).abs() < 0.01, "{sum}");
+    for axis in 0..2 {
+        assert!(
+            (center[axis] - f64::from(normal[axis])).abs() < 0.01,
+            "{center:?} {normal:?}"
+        );
+    }
+    let coloured = image::open(folder.path().join("ndf.png")).unwrap().into_rgb8();
+    assert!(coloured.width() > 64 && coloured.height() > 64);
+}
+
+#[test]
+fn the_same_flakes_come_from_the_same_seed() {
+    let folder = folder_with_map();
+    let bytes = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    for (name, seed) in [("a.exr", "1"), ("b.exr", "1"), ("c.exr", "2")] {
+        succeeds(
+            folder.path(),
+            &["flakes", "-o", name, "--size", "64", "--seed", seed],
+        );
+    }
+    assert!(bytes("a.exr") == bytes("b.exr"));
+    assert!(bytes("a.exr") != bytes("c.exr"));
+    assert_eq!(
+        files(folder.path()),
+        ["a.exr", "b.exr", "c.exr", "flakes.exr", "mask.png"]
+    );
+}
+
+#[test]
+fn a_saved_structure_tells_what_it_is() {
+    let folder = folder_with_map();
+    let precompute = ["precompute", "ibm", "flakes.exr", "-o", "flakes.glints"];
+    let told = succeeds(
+        folder.path(),
+        &[&precompute[..], &["--alpha", "0.004", "--distribution", "ggx"]].concat(),
+    );
+    assert!(told.starts_with("flakes.glints: "), "{told}");
+    assert_eq!(files(folder.path()), ["flakes.exr", "flakes.glints", "mask.png"]);
+    let text = succeeds(folder.path(), &["info", "flakes.glints"]);
+    for word in ["128 x 128 texels", "alpha 0.004", "ggx"] {
+        assert!(text.contains(word), "{word:?} is not in {text}");
+    }
+    let header = json(folder.path(), &["info", "flakes.glints", "--json"]);
+    assert_eq!(header["width"], 128);
+    assert_eq!(header["alpha"], 0.004);
+    let path = folder.path().join("flakes.glints");
+    let bytes = std::fs::read(&path).unwrap();
+    assert_eq!(header["file_bytes"], bytes.len());
+
+    fails(folder.path(), &precompute, 1, &["exists already"]);
+    succeeds(folder.path(), &[&precompute[..], &["--force"]].concat());
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let refused = ["flakes.glints", "bytes instead of", "glints precompute"];
+    fails(folder.path(), &["info", "flakes.glints"], 1, &refused);
+}
+
+#[test]
+fn nothing_is_overwritten_without_being_asked() {
+    let folder = folder_with_map();
+    let before = std::fs::read(folder.path().join("flakes.exr")).unwrap();
+    let exists = ["flakes.exr", "exists already", "--force"];
+    fails(
+        folder.path(),
+        &["flakes", "-o", "flakes.exr", "--size", "8"],
+        1,
+        &exists,
+    );
+    fails(
+        folder.path(),
+        &["precompute", "ibm", "mask.png", "-o", "flakes.exr"],
+        1,
+        &exists,
+    );
+    let onto_itself = [
+        "ndf",
+        "flakes.exr",
+        "--footprint",
+        "1",
+        "-o",
+        "flakes.exr",
+        "--force",
+    ];
+    fails(folder.path(), &onto_itself, 1, &["the file to be read"]);
+    assert!(std::fs::read(folder.path().join("flakes.exr")).unwrap() == before);
+    succeeds(
+        folder.path(),
+        &["flakes", "-o", "flakes.exr", "--size", "8", "--force"],
+    );
+    assert!(std::fs::read(folder.path().join("flakes.exr")).unwrap() != before);
+}
+
+#[test]
+fn wrong_usage_is_told_in_one_line() {
+    let folder = folder_with_map();
+    let run = |arguments: &[&str], words: &[&str]| fails(folder.path(), arguments, 2, words);
+    run(&[], &["--help"]);
+    run(&["inof"], &["inof", "info"]);
+    run(&["ndf", "flakes.exr", "-o", "a.png"], &["--footprint"]);
+    let ndf = |more: &[&str], words: &[&str]| {
+        run(
+            &[&["ndf", "flakes.exr", "-o", "a.png", "--footprint", "4"], more].concat(),
+            words,
+        );
+    };
+    ndf(&["--method", "direkt"], &["direkt", "direct"]);
+    ndf(&["--alpha", "7"], &["alpha", "7"]);
+    ndf(&["--at", "0.5"], &["--at", "2 numbers"]);
+    ndf(&["--size", "1000000"], &["--size", "4096"]);
+    ndf(
+        &["--method", "yan16", "--distribution", "ggx"],
+        &["distribution", "yan16"],
+    );
+    run(
+        &["ndf", "flakes.exr", "-o", "a.png", "--footprint", "-3"],
+        &["--footprint", "negative"],
+    );
+    run(
+        &["ndf", "flakes.exr", "-o", "a.jpg", "--footprint", "3"],
+        &["a.jpg", ".png", ".exr"],
+    );
+    run(&["info", "flakes.exr", "--alpha", "0.01,nan"], &["alpha", "NaN"]);
+    run(&["flakes", "-o", "b.exr", "--density", "0"], &["density"]);
+    run(&["flakes", "-o", "b.exr", "--mask", "b.exr"], &["--mask"]);
+    run(
+        &["precompute", "ibm", "flakes.exr", "-o", "s", "--alpha", "0"],
+        &["alpha"],
+    );
+    assert_eq!(files(folder.path()), ["flakes.exr", "mask.png"]);
+}
+
+#[test]
+fn hostile_files_are_refused_in_one_line() {
+    let folder = folder_with_map();
+    let good = std::fs::read(folder.path().join("flakes.exr")).unwrap();
+    let mut broken: Vec<(String, Vec<u8>)> = vec![
+        ("empty".into(), vec![]),
+        ("text.png".into(), b"not a picture\n".to_vec()),
+        (
+            "header.png".into(),
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\xff\xff\xff\xff".to_vec(),
+        ),
+    ];
+    for cut in [5, 40, 300, good.len() / 2, good.len() - 1] {
+        broken.push((format!("cut-{cut}.exr"), good[..cut].to_vec()));
+    }
+    for (index, byte) in [(8, 0xff), (60, 0xff), (200, 0x80), (310, 0xff)] {
+        let mut damaged = good.clone();
+        for place in &mut damaged[index..index + 8] {
+            *place = byte;
+        }
+        broken.push((format!("damaged-{index}.exr"), damaged));
+    }
+    for (name, bytes) in &broken {
+        std::fs::write(folder.path().join(name), bytes).unwrap();
+        let output = glints(folder.path(), &["info", name]);
+        let message = String::from_utf8(output.stderr).unwrap();
+        // Damage to a header's field may leave a readable map.
+        assert!(matches!(output.status.code(), Some(0 | 1)), "{name}: {message}");
+        assert!(!message.contains("internal error"), "{name}: {message}");
+        if output.status.code() == Some(1) {
+            assert!(
+                message.contains(name.as_str()) && message.lines().count() == 1,
+                "{message}"
+            );
+        }
+    }
+    fails(folder.path(), &["info", "no-such.exr"], 1, &["no-such.exr"]);
+    fails(folder.path(), &["info", "."], 1, &["\".\""]);
+    fails(
+        folder.path(),
+        &["info", "mask.png"],
+        1,
+        &["mask.png", "three channels"],
+    );
+    let nowhere = ["flakes", "-o", "no/where.exr"];
+    fails(folder.path(), &nowhere, 1, &["no/where.exr", "does not exist"]);
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_failure() {
+    let folder = folder_with_map();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_glints"))
+        .args(["info", "flakes.exr"])
+        .current_dir(folder.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success());
+    assert!(output.stderr.is_empty());
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interruption_leaves_no_file() {
+    use std::time::{Duration, Instant};
+
+    let folder = tempfile::tempdir().unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_glints"))
+        .args(["flakes", "-o", "big.exr", "--size", "2048", "--flake-size", "4"])
+        .current_dir(folder.path())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    // The temporary folder tells that writing has begun.
+    let hidden = || {
+        files(folder.path())
+            .into_iter()
+            .find(|name| name.starts_with(".glints-"))
+    };
+    let start = Instant::now();
+    let staging = loop {
+        if let Some(name) = hidden() {
+            break Some(PathBuf::from(name));
+        }
+        if child.try_wait().unwrap().is_some() || start.elapsed() > Duration::from_secs(60) {
+            break None;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    };
+    assert!(staging.is_some(), "writing was never seen");
+    let killed = Command::new("kill")
+        .args(["-INT", &child.id().to_string()])
+        .status();
+    assert!(killed.unwrap().success());
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert_eq!(files(folder.path()), [""; 0]);
+}

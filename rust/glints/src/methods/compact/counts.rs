@@ -1,0 +1,403 @@
+//! Counts of texels by direction, for squares of texels of several sizes: what a footprint holds entirely.
+//!
+//! **Computes** For a node of the [`super::cover::Tree`], how many of its texels have their normal in each bin: an integral
+//! histogram, like the inverse bin map, but only where a node has about as many texels as there are bins, so that it costs
+//! less than the texels. Bins are squares of equal solid angle over Lambert's projection `X = (x, y) / sqrt(1 + z)`, which
+//! maps the hemisphere to the unit disk; a projected hemisphere has bins that get too long as normals tilt.
+//!
+//! **Two moments are exact.** Bins of width w move a normal by up to w / 2. Here a texel's bin is found after adding
+//! triangular noise of +-w to its position, from a hash of the texel: over texels, the bins' centres then have the mean of
+//! the normals and their covariance plus `w^2 / 4`, wherever in their bins the normals lie (a bin is drawn with the
+//! probability of a quadratic B-spline, which reproduces polynomials of degree two). The bins' lobes are narrower by just
+//! that variance: `alpha_b^2 = alpha^2 - 2 w^2 / (1 + z)` along the tilt, `alpha^2 - w^2 (1 + z) / 2` across it. What is left
+//! is noise, about `0.5 / sqrt(n)` where n lobes overlap.
+//!
+//! **Layout** One array a level, nodes row by row, bins of a node row by row, of the narrowest whole numbers that hold the
+//! level's largest count.
+
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+use wide::{CmpLe, f32x8};
+
+use super::array::Array;
+use super::cover::{Node, Tree};
+use super::grid::Grid;
+use super::lobes::{LANES, Lobe, Normals, Query, Sums};
+
+/// Width of a bin in standard deviations of a lobe, `alpha / sqrt 2`: one of them in angle; the paper has 1.2 (Eq. 16 of Atanasov et al.
+/// 2021). Wider ones show through the lobes that are left.
+const BIN_WIDTH: f64 = 0.7;
+
+/// Least share of the squared roughness that a bin's lobe keeps.
+const LEAST_SHARE: f32 = 0.2;
+
+/// Numbers after the end of a level that a query may read and ignore.
+pub const PADDING: usize = 32;
+
+/// Rows and groups of eight columns of bins that a lobe may reach.
+const ROWS: usize = 24;
+const COLUMNS: usize = 3;
+
+/// See the module.
+pub struct Counts {
+    bins: Grid,
+    alpha2: f32,
+    /// Level by level, finest first; levels below the finest kept one are absent.
+    levels: Vec<Option<Level>>,
+}
+
+/// Counts of the nodes of one level.
+pub enum Level {
+    U8(Array<u8>),
+    U16(Array<u16>),
+    U32(Array<u32>),
+}
+
+impl Level {
+    pub fn bytes(&self) -> usize {
+        match self {
+            Self::U8(counts) => counts.bytes(),
+            Self::U16(counts) => counts.bytes(),
+            Self::U32(counts) => counts.bytes(),
+        }
+    }
+
+    #[inline]
+    fn get(&self, index: usize) -> u32 {
+        match self {
+            Self::U8(counts) => counts[index].into(),
+            Self::U16(counts) => counts[index].into(),
+            Self::U32(counts) => counts[index],
+        }
+    }
+}
+
+/// Lambert's projection of the hemisphere to the unit disk; areas are half of solid angles.
+#[inline]
+pub fn project(normal: Vec3) -> Vec2 {
+    normal.truncate() / (1.0 + normal.z).sqrt()
+}
+
+/// Width of the bins over the projection.
+pub fn bin_width(alpha: f32) -> f64 {
+    BIN_WIDTH * f64::from(alpha) / std::f64::consts::SQRT_2
+}
+
+/// The bins of normals whose projections lie between two bounds: as wide as [`bin_width`], and one more on each side, for
+/// the noise.
+pub fn bins(alpha: f32, bounds: (Vec2, Vec2)) -> Grid {
+    let width = bin_width(alpha);
+    Grid::covering((bounds.0 - width as f32, bounds.1 + width as f32), width)
+}
+
+impl Counts {
+    /// Counts the texels of all nodes of the levels from `finest` up; `normal` is that of a texel, as it is queried later.
+    pub fn new(
+        tree: &Tree,
+        bins: Grid,
+        alpha: f32,
+        finest: usize,
+        normal: impl Fn(u32, u32) -> Vec3 + Sync,
+    ) -> Self {
+        let mut counts = Self::from_levels(bins, alpha, Vec::new());
+        counts.levels.resize_with(finest.min(tree.levels()), || None);
+        if finest >= tree.levels() {
+            return counts;
+        }
+        let stride = counts.stride();
+        let base = level(tree, finest, stride, |node, histogram| {
+            let rect = tree.rect(node);
+            for row in rect.low.1..rect.high.1 {
+                for column in rect.low.0..rect.high.0 {
+                    histogram[counts.bin(normal(column, row), (column, row))] += 1;
+                }
+            }
+        });
+        counts.levels.push(Some(base));
+        for index in finest + 1..tree.levels() {
+            let finer = counts.levels[index - 1].as_ref().expect("the finer level");
+            let coarser = level(tree, index, stride, |node, histogram| {
+                for child in tree.children(node) {
+                    let start = tree.index(&child) * stride;
+                    for (bin, sum) in histogram.iter_mut().enumerate() {
+                        *sum += finer.get(start + bin);
+                    }
+                }
+            });
+            counts.levels.push(Some(coarser));
+        }
+        counts
+    }
+
+    pub fn from_levels(bins: Grid, alpha: f32, levels: Vec<Option<Level>>) -> Self {
+        Self {
+            bins,
+            alpha2: alpha * alpha,
+            levels,
+        }
+    }
+
+    pub fn bins(&self) -> &Grid {
+        &self.bins
+    }
+
+    pub fn levels(&self) -> &[Option<Level>] {
+        &self.levels
+    }
+
+    /// Whether the nodes of a level have counts.
+    #[inline]
+    pub fn has(&self, level: usize) -> bool {
+        self.levels.get(level).is_some_and(Option::is_some)
+    }
+
+    pub fn bytes(&self) -> usize {
+        self.levels.iter().flatten().map(Level::bytes).sum()
+    }
+
+    /// Share of the map's texels within reach of a half vector that one of them reflects at; zero without counts.
+    pub fn share(&self, tree: &Tree, lobe: &Lobe) -> f64 {
+        let Some(Some(root)) = self.levels.get(tree.levels() - 1) else {
+            return 0.0;
+        };
+        let counts = || (0..self.stride()).map(|bin| f64::from(root.get(bin)));
+        let concentration = counts().map(|n| n * n).sum::<f64>() / counts().sum::<f64>().powi(2).max(1.0);
+        // A solid angle is twice its projection's area.
+        let bins = 0.5 * std::f64::consts::PI * f64::from(lobe.reach() / self.bins.pitch).powi(2);
+        (concentration * bins).min(1.0)
+    }
+
+    fn stride(&self) -> usize {
+        self.bins.size[0] as usize * self.bins.size[1] as usize
+    }
+
+    /// The bin of a texel.
+    #[inline]
+    fn bin(&self, normal: Vec3, (column, row): (u32, u32)) -> usize {
+        let [x, y] = self.noisy_cell(normal, (column, row));
+        y as usize * self.bins.size[0] as usize + x as usize
+    }
+
+    #[inline]
+    fn noisy_cell(&self, normal: Vec3, (column, row): (u32, u32)) -> [u32; 2] {
+        let hash = hash(column, row);
+        let projection = project(normal);
+        let triangular = |bits: u32| ((bits & 0xff) + (bits >> 8 & 0xff)) as f32 / 256.0 - 255.0 / 256.0;
+        let noise = [triangular(hash), triangular(hash >> 16)];
+        std::array::from_fn(|axis| {
+            let position = (projection[axis] - self.bins.low[axis]) / self.bins.pitch + noise[axis];
+            (position as u32).min(self.bins.size[axis] - 1)
+        })
+    }
+
+    /// Draws a half vector of the lobe that stands for a texel where its node is counted.
+    pub fn sample(&self, lobe: &Lobe, normal: Vec3, texel: (u32, u32), u: [f32; 2]) -> Option<Vec3> {
+        let [x, y] = self.noisy_cell(normal, texel);
+        let axis = |axis, cell: u32| self.bins.middle(axis, f32x8::splat(cell as f32));
+        let Bins {
+            t,
+            along,
+            across,
+            shares,
+        } = self.lobes(axis(0, x), axis(1, y));
+        let first =
+            |[x, y, z]: [f32x8; 3]| Vec3::new(x.as_array_ref()[0], y.as_array_ref()[0], z.as_array_ref()[0]);
+        let root = |share: f32x8| share.as_array_ref()[0].sqrt();
+        let axes = [first(along) * root(shares[0]), first(across) * root(shares[1])];
+        let m = lobe.sample_along(first([t.x, t.y, t.z]), axes, u);
+        (m.z > 0.0).then_some(m)
+    }
+
+    /// The lobes of bins around projections `(x, y)`. Bins across the rim are moved inside, to about the middle of what lies
+    /// on the hemisphere.
+    #[inline]
+    fn lobes(&self, x: f32x8, y: f32x8) -> Bins {
+        let limit = 1.0 - 0.3 * self.bins.pitch.min(1.0);
+        let radius2 = x.mul_add(x, y * y).fast_max(f32x8::splat(1e-12));
+        let radius = radius2.sqrt();
+        let (cos, sin) = (x / radius, y / radius);
+        let radius = radius.fast_min(f32x8::splat(limit));
+        let z = 1.0 - radius * radius;
+        let sine = radius * (1.0 + z).sqrt();
+        let taken = 0.5 * self.bins.pitch * self.bins.pitch / self.alpha2;
+        let share = |taken: f32x8| (1.0 - taken).fast_max(f32x8::splat(LEAST_SHARE));
+        Bins {
+            t: Normals {
+                x: cos * sine,
+                y: sin * sine,
+                z,
+            },
+            along: [cos * z, sin * z, -sine],
+            across: [-sin, cos, f32x8::ZERO],
+            shares: [share(4.0 * taken / (1.0 + z)), share((1.0 + z) * taken)],
+        }
+    }
+}
+
+/// The lobes of eight bins.
+struct Bins {
+    t: Normals,
+    /// Unit vectors across t, along and across its tilt.
+    along: [f32x8; 3],
+    across: [f32x8; 3],
+    /// Shares of the squared roughness along these axes.
+    shares: [f32x8; 2],
+}
+
+/// Weighted counts of the bins within reach of a half vector.
+pub struct CountSum<'a> {
+    counts: &'a Counts,
+    first: (usize, usize),
+    rows: usize,
+    columns: usize,
+    sums: [[f32x8; COLUMNS]; ROWS],
+    used: bool,
+}
+
+impl<'a> CountSum<'a> {
+    pub fn new(counts: &'a Counts, half: Vec3, reach: f32) -> Self {
+        let bins = &counts.bins;
+        let projection = project(half);
+        // Across the tilt, angles are longest in the projection.
+        let reach = reach / (1.0 + half.z - reach).max(1.0).sqrt() / bins.pitch;
+        let range = |axis: usize| {
+            let center = (projection[axis] - bins.low[axis]) / bins.pitch - 0.5;
+            let first = (center - reach).ceil().max(0.0) as usize;
+            let end = ((center + reach).floor() + 1.0).max(0.0) as usize;
+            first..end.min(bins.size[axis] as usize)
+        };
+        let (columns, rows) = (range(0), range(1));
+        Self {
+            counts,
+            first: (columns.start, rows.start),
+            rows: rows.len().min(ROWS),
+            columns: columns.len().div_ceil(8).min(COLUMNS),
+            sums: [[f32x8::ZERO; COLUMNS]; ROWS],
+            used: false,
+        }
+    }
+
+    /// Adds the counts of a node, each times `weight`.
+    #[inline]
+    pub fn add(&mut self, tree: &Tree, node: &Node, weight: f32) {
+        let Some(level) = &self.counts.levels[node.level] else {
+            return;
+        };
+        // No bin is within reach: the window may begin behind the last one.
+        if self.rows == 0 || self.columns == 0 {
+            return;
+        }
+        let stride = self.counts.bins.size[0] as usize;
+        let start = tree.index(node) * self.counts.stride() + self.first.1 * stride + self.first.0;
+        let weight = f32x8::splat(weight);
+        match level {
+            Level::U8(counts) => self.add_rows(&counts[start..], stride, weight, |c| c.into()),
+            Level::U16(counts) => self.add_rows(&counts[start..], stride, weight, |c| c.into()),
+            Level::U32(counts) => self.add_rows(&counts[start..], stride, weight, |c| c as i32 as f32),
+        }
+        self.used = true;
+    }
+
+    #[inline]
+    fn add_rows<T: Copy>(&mut self, counts: &[T], stride: usize, weight: f32x8, float: impl Fn(T) -> f32) {
+        for (row, sums) in self.sums[..self.rows].iter_mut().enumerate() {
+            for (column, sum) in sums[..self.columns].iter_mut().enumerate() {
+                let start = row * stride + 8 * column;
+                let eight: &[T; 8] = counts[start..start + 8].try_into().expect("eight counts");
+                let mut floats = [0.0; 8];
+                for (float_count, &count) in floats.iter_mut().zip(eight) {
+                    *float_count = float(count);
+                }
+                *sum = f32x8::from(floats).mul_add(weight, *sum);
+            }
+        }
+    }
+
+    /// Adds the lobes of all bins.
+    pub fn finish(&self, query: &Query, lobe: &Lobe, sums: &mut Sums) {
+        if !self.used {
+            return;
+        }
+        let bins = &self.counts.bins;
+        for (row, weights) in self.sums[..self.rows].iter().enumerate() {
+            let y = bins.middle(1, f32x8::splat((self.first.1 + row) as f32));
+            for (column, &weights) in weights[..self.columns].iter().enumerate() {
+                let columns = LANES + (self.first.0 + 8 * column) as f32;
+                // Lanes beyond the last bin hold the next row's.
+                let exists = columns.cmp_le(f32x8::splat(bins.size[0] as f32 - 1.0));
+                let Bins {
+                    t,
+                    along,
+                    across,
+                    shares,
+                } = self.counts.lobes(bins.middle(0, columns), y);
+                let dot = |v: [f32x8; 3]| {
+                    let h = query.half;
+                    v[0].mul_add(f32x8::splat(h.x), v[1].mul_add(f32x8::splat(h.y), v[2] * h.z))
+                };
+                let cos = dot([t.x, t.y, t.z]).fast_max(f32x8::splat(1e-3));
+                let (along, across) = (dot(along), dot(across));
+                let slope2 = (along * along / shares[0] + across * across / shares[1]) / (cos * cos);
+                let x = slope2 * lobe.sharpness();
+                let weights = weights & exists & x.cmp_le(f32x8::splat(lobe.limit()));
+                if weights == f32x8::ZERO {
+                    continue;
+                }
+                let peak = lobe.peak() / (shares[0] * shares[1]).sqrt();
+                sums.add_terms(&query.terms(x, peak, cos, &t), weights);
+            }
+        }
+    }
+}
+
+/// Fills one level: `count` adds up a node's histogram.
+fn level(tree: &Tree, index: usize, stride: usize, count: impl Fn(&Node, &mut [u32]) + Sync) -> Level {
+    let nodes = tree.nodes(index);
+    let histogram = |histogram: &mut Vec<u32>, k: usize| {
+        histogram.clear();
+        histogram.resize(stride, 0);
+        count(&tree.node(index, k), histogram);
+    };
+    let largest = (0..nodes)
+        .into_par_iter()
+        .map_init(Vec::new, |scratch, k| {
+            histogram(scratch, k);
+            scratch.iter().copied().max().unwrap_or(0)
+        })
+        .max()
+        .unwrap_or(0);
+    fn fill<T: Copy + Default + Send>(
+        nodes: usize,
+        stride: usize,
+        histogram: impl Fn(&mut Vec<u32>, usize) + Sync,
+        narrow: impl Fn(u32) -> T + Sync,
+    ) -> Vec<T> {
+        let mut counts = vec![T::default(); nodes * stride + PADDING];
+        counts[..nodes * stride]
+            .par_chunks_mut(stride)
+            .enumerate()
+            .for_each_init(Vec::new, |scratch, (k, counts)| {
+                histogram(scratch, k);
+                for (narrowed, &count) in counts.iter_mut().zip(scratch.iter()) {
+                    *narrowed = narrow(count);
+                }
+            });
+        counts
+    }
+    if largest <= u8::MAX.into() {
+        Level::U8(fill(nodes, stride, histogram, |c| c as u8).into())
+    } else if largest <= u16::MAX.into() {
+        Level::U16(fill(nodes, stride, histogram, |c| c as u16).into())
+    } else {
+        Level::U32(fill(nodes, stride, histogram, |c| c).into())
+    }
+}
+
+/// Bits of a texel that look random: the finaliser of MurmurHash3.
+#[inline]
+fn hash(column: u32, row: u32) -> u32 {
+    let mut h = column ^ row.wrapping_mul(0x9e37_79b1);
+    h = (h ^ h >> 16).wrapping_mul(0x85eb_ca6b);
+    h = (h ^ h >> 13).wrapping_mul(0xc2b2_ae35);
+    h ^ h >> 16
+}

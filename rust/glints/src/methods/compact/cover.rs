@@ -1,0 +1,313 @@
+//! How a footprint is covered by nodes of a quadtree over the map.
+//!
+//! A node inside the footprint is taken as a whole. One that its border cuts is taken apart, down to single texels, unless
+//! it is small against the footprint: then it is taken as a whole, too, weighted by the share of its area inside. That
+//! blurs the border; with nodes of side s, of which a footprint of area a and perimeter p cuts about p / s, and whose
+//! distributions deviate from the part's inside by d, the error is about
+//!
+//! ```text
+//! sqrt(p / s) s^2 / a * 0.4 d,
+//! ```
+//!
+//! a random walk over the cut nodes, since each has too much as often as too little. A node is small if that is below
+//! [`TOLERANCE`]. Of n texels within reach of a half vector, a part has another share than the whole by about
+//! `1 / sqrt(n)`; as texels are not independent, and maps not the same everywhere, d is taken as [`CLUSTERING`] times as
+//! much, and not below [`LEAST_DEVIATION`].
+
+use glam::DVec2;
+
+use crate::footprint::{Coverage, Footprint, Parallelogram};
+
+/// Relative error that blurring the border may cost.
+const TOLERANCE: f64 = 0.013;
+
+/// How much more the parts of a node deviate than those of independent texels would.
+const CLUSTERING: f64 = 4.0;
+
+/// Bounds of the relative deviation of a node's part from the node.
+const LEAST_DEVIATION: f64 = 0.15;
+const LARGEST_DEVIATION: f64 = 0.5;
+
+/// A rectangle of texels, half open.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rect {
+    pub low: (u32, u32),
+    pub high: (u32, u32),
+}
+
+/// A quadtree whose leaves have `2^leaf_bits` texels a side, over a map that its root holds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Tree {
+    map: (u32, u32),
+    leaf_bits: u32,
+    levels: usize,
+}
+
+/// A node of a level, by column and row; level 0 are the leaves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Node {
+    pub level: usize,
+    pub row: u32,
+    pub column: u32,
+}
+
+/// What a footprint does with a node.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Treatment {
+    Nothing,
+    Descend,
+    /// All its texels alike, each with this weight.
+    Whole(f64),
+    /// A leaf's texels, each with its own area in the region.
+    Texels,
+}
+
+/// The levels that a footprint is covered with.
+#[derive(Clone, Copy, Debug)]
+pub struct Scale {
+    /// Side in texels up to which a cut node is taken as a whole.
+    pub small: f64,
+    /// Level whose nodes are taken apart into texels.
+    pub leaf: usize,
+}
+
+/// The part of a footprint in one period of the map, and how it treats nodes.
+#[derive(Clone, Copy)]
+pub struct Part<'a> {
+    /// `None`: all of the map.
+    region: Option<&'a Parallelogram>,
+    scale: Scale,
+    /// Of s and t: gradient per texel, value at the map's corner, and variation over half a texel.
+    slabs: [(DVec2, f64, f64); 2],
+}
+
+impl<'a> Part<'a> {
+    pub fn new(region: Option<&'a Parallelogram>, scale: Scale) -> Self {
+        let slabs = region.map_or([(DVec2::ZERO, 0.0, 0.0); 2], |region| {
+            let [s, t] = region.slabs_at(DVec2::ZERO);
+            [s, t].map(|(g, value)| (g, value, 0.5 * (g.x.abs() + g.y.abs())))
+        });
+        Self { region, scale, slabs }
+    }
+
+    /// How a square of `side` texels, the map's side excepted, lies to the region.
+    #[inline]
+    fn coverage(&self, low: DVec2, side: f64) -> Coverage {
+        let center = low + 0.5 * side;
+        let [(gs, s0, rs), (gt, t0, rt)] = &self.slabs;
+        let (s, t) = ((gs.dot(center) + s0).abs(), (gt.dot(center) + t0).abs());
+        let (rs, rt) = (rs * side, rt * side);
+        if s - rs >= 0.5 || t - rt >= 0.5 {
+            Coverage::Outside
+        } else if s + rs <= 0.5 && t + rt <= 0.5 {
+            Coverage::Inside
+        } else {
+            Coverage::Cut
+        }
+    }
+}
+
+impl Treatment {
+    /// The same `count` times.
+    pub fn scaled(self, count: f64) -> Self {
+        match self {
+            Self::Whole(weight) => Self::Whole(weight * count),
+            other => other,
+        }
+    }
+}
+
+impl Rect {
+    fn bounds(&self) -> (DVec2, DVec2) {
+        let point = |(x, y): (u32, u32)| DVec2::new(f64::from(x), f64::from(y));
+        (point(self.low), point(self.high))
+    }
+
+    /// Number of texels.
+    pub fn area(&self) -> f64 {
+        let (low, high) = self.bounds();
+        (high - low).element_product()
+    }
+}
+
+impl Tree {
+    pub fn new(map: (u32, u32), leaf_bits: u32) -> Self {
+        let side = map.0.max(map.1).next_power_of_two().trailing_zeros();
+        Self {
+            map,
+            leaf_bits,
+            levels: side.saturating_sub(leaf_bits) as usize + 1,
+        }
+    }
+
+    /// Number of levels; the last one is the root.
+    pub fn levels(&self) -> usize {
+        self.levels
+    }
+
+    pub fn root(&self) -> Node {
+        Node {
+            level: self.levels - 1,
+            row: 0,
+            column: 0,
+        }
+    }
+
+    /// Side of the nodes of a level.
+    pub fn side(&self, level: usize) -> u32 {
+        1 << (self.leaf_bits + level as u32)
+    }
+
+    fn columns(&self, level: usize) -> u32 {
+        self.map.0.div_ceil(self.side(level))
+    }
+
+    /// Side in texels up to which a node is small against the footprint; `share`: of the map's texels, those within reach
+    /// of a half vector.
+    pub fn small_side(&self, footprint: &Footprint, share: f64) -> f64 {
+        let perimeter: f64 = footprint.edges().iter().map(|edge| 2.0 * edge.length()).sum();
+        let error = |side: f64| {
+            let deviation = CLUSTERING / (side * share.sqrt()).max(1e-9);
+            let walk = (perimeter / side).sqrt() * side * side / footprint.area();
+            0.4 * walk * deviation.clamp(LEAST_DEVIATION, LARGEST_DEVIATION)
+        };
+        let sides = (0..self.levels).map(|level| f64::from(self.side(level)));
+        sides
+            .take_while(|&side| error(side) <= TOLERANCE)
+            .last()
+            .unwrap_or(0.0)
+    }
+
+    /// Number of nodes of a level.
+    pub fn nodes(&self, level: usize) -> usize {
+        self.columns(level) as usize * self.map.1.div_ceil(self.side(level)) as usize
+    }
+
+    /// The node of an index in its level.
+    pub fn node(&self, level: usize, index: usize) -> Node {
+        let columns = self.columns(level) as usize;
+        Node {
+            level,
+            row: (index / columns) as u32,
+            column: (index % columns) as u32,
+        }
+    }
+
+    /// Index of a node in its level.
+    #[inline]
+    pub fn index(&self, node: &Node) -> usize {
+        node.row as usize * self.columns(node.level) as usize + node.column as usize
+    }
+
+    /// The texels of a node.
+    #[inline]
+    pub fn rect(&self, node: &Node) -> Rect {
+        let side = self.side(node.level);
+        let low = (node.column * side, node.row * side);
+        Rect {
+            low,
+            high: ((low.0 + side).min(self.map.0), (low.1 + side).min(self.map.1)),
+        }
+    }
+
+    /// The nodes of the next finer level inside a node, which is not a leaf.
+    #[inline]
+    pub fn children(&self, node: &Node) -> impl Iterator<Item = Node> + use<> {
+        let level = node.level - 1;
+        let (side, map) = (self.side(level), self.map);
+        let (row, column) = (2 * node.row, 2 * node.column);
+        [(0, 0), (0, 1), (1, 0), (1, 1)]
+            .into_iter()
+            .map(move |(dy, dx)| Node {
+                level,
+                row: row + dy,
+                column: column + dx,
+            })
+            .filter(move |child| child.column * side < map.0 && child.row * side < map.1)
+    }
+
+    /// The node of a level that holds a texel.
+    fn ancestor(&self, level: usize, (column, row): (u32, u32)) -> Node {
+        let shift = self.leaf_bits + level as u32;
+        Node {
+            level,
+            row: row >> shift,
+            column: column >> shift,
+        }
+    }
+
+    /// What `part` does with a node; `is_unit` tells whether the nodes of a level can be taken as a whole.
+    #[inline]
+    fn treatment(&self, part: &Part, node: &Node, is_unit: &impl Fn(usize) -> bool) -> Treatment {
+        let whole = is_unit(node.level);
+        let Some(region) = part.region else {
+            let ends_here = whole || node.level == part.scale.leaf;
+            return if ends_here {
+                Treatment::Whole(1.0)
+            } else {
+                Treatment::Descend
+            };
+        };
+        // A node that reaches over the map's far sides is taken as if it did not end there: what lies inside the
+        // region does so anyway.
+        let side = f64::from(self.side(node.level));
+        let corner = DVec2::new(f64::from(node.column), f64::from(node.row)) * side;
+        match part.coverage(corner, side) {
+            Coverage::Outside => Treatment::Nothing,
+            Coverage::Inside if whole => Treatment::Whole(1.0),
+            Coverage::Cut if whole && side <= part.scale.small => {
+                let rect = self.rect(node);
+                let (low, high) = rect.bounds();
+                Treatment::Whole(region.overlap(low, high) / rect.area())
+            }
+            _ if node.level == part.scale.leaf => Treatment::Texels,
+            _ => Treatment::Descend,
+        }
+    }
+
+    /// Calls `visit` with the nodes that cover `part`, and how each is treated.
+    pub fn cover(
+        &self,
+        part: &Part,
+        is_unit: &impl Fn(usize) -> bool,
+        visit: &mut impl FnMut(&Node, Treatment),
+    ) {
+        self.cover_node(part, &self.root(), is_unit, visit);
+    }
+
+    fn cover_node(
+        &self,
+        part: &Part,
+        node: &Node,
+        is_unit: &impl Fn(usize) -> bool,
+        visit: &mut impl FnMut(&Node, Treatment),
+    ) {
+        match self.treatment(part, node, is_unit) {
+            Treatment::Nothing => {}
+            Treatment::Descend => {
+                for child in self.children(node) {
+                    self.cover_node(part, &child, is_unit, visit);
+                }
+            }
+            treatment => visit(node, treatment),
+        }
+    }
+
+    /// The node with which [`Self::cover`] covers a texel, and how it is treated.
+    pub fn covering(
+        &self,
+        part: &Part,
+        texel: (u32, u32),
+        is_unit: &impl Fn(usize) -> bool,
+    ) -> (Node, Treatment) {
+        for level in (part.scale.leaf + 1..self.levels).rev() {
+            let node = self.ancestor(level, texel);
+            match self.treatment(part, &node, is_unit) {
+                Treatment::Descend => {}
+                treatment => return (node, treatment),
+            }
+        }
+        let leaf = self.ancestor(part.scale.leaf, texel);
+        (leaf, self.treatment(part, &leaf, is_unit))
+    }
+}

@@ -1,0 +1,120 @@
+use super::*;
+use crate::flakes::Normalization;
+use crate::microfacet::{Distribution, Flake};
+use proptest::prelude::*;
+
+pub fn model(alpha: f32) -> FlakeModel {
+    FlakeModel {
+        flake: Flake::new(Distribution::Beckmann, alpha).unwrap(),
+        normalization: Normalization::Projected,
+    }
+}
+
+/// A map of random normals with slopes up to `slope`.
+pub fn random_map(width: u32, height: u32, slope: f32, seed: u32) -> NormalMap {
+    let random = |i: u32| {
+        let mut h = i.wrapping_mul(0x9e37_79b1) ^ seed;
+        h = (h ^ h >> 15).wrapping_mul(0x85eb_ca6b);
+        h = (h ^ h >> 13).wrapping_mul(0xc2b2_ae35);
+        (h ^ h >> 16) as f32 / u32::MAX as f32 * 2.0 - 1.0
+    };
+    let normals: Vec<Vec3> = (0..width * height)
+        .map(|i| Vec3::new(slope * random(2 * i), slope * random(2 * i + 1), 1.0))
+        .collect();
+    NormalMap::from_normals("random", width, height, &normals).unwrap()
+}
+
+/// Largest distance of a stored normal's projection from the map's, in steps of the quantisation.
+fn largest_distance(map: &NormalMap, compact: &CompactBinMap) -> f32 {
+    let texels = (0..map.height()).flat_map(|row| (0..map.width()).map(move |column| (column, row)));
+    let distance = |(column, row)| {
+        (compact.normal(column, row) - map.normal(column, row))
+            .truncate()
+            .abs()
+            .max_element()
+    };
+    texels.map(distance).fold(0.0, f32::max) / compact.texels.pitch()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    #[test]
+    fn every_texel_is_found_again(width in 1..300_u32, height in 1..300_u32, slope in 0.0..2.0_f32, seed: u32, rough: bool) {
+        let map = random_map(width, height, slope, seed);
+        let compact = CompactBinMap::new(&map, model(if rough { 0.3 } else { 0.004 }));
+        // Half a step, and rounding.
+        prop_assert!(largest_distance(&map, &compact) < 0.51);
+    }
+}
+
+#[test]
+fn blocks_of_a_single_cell_are_found_again() {
+    // 2^16 texels in one row of cells: offsets take 32 bits.
+    for slope in [0.0, 0.4] {
+        let normals: Vec<Vec3> = (0..512 * 300)
+            .map(|i| {
+                if i % 7919 == 1 {
+                    Vec3::new(slope, -0.9, 1.0)
+                } else {
+                    Vec3::new(0.3, 0.2, 1.0)
+                }
+            })
+            .collect();
+        let map = NormalMap::from_normals("flat", 512, 300, &normals).unwrap();
+        let geometry = block_geometry((512, 300), 0.004, 1e-4, grid::bounds(&map, Vec3::truncate));
+        let blocks = Blocks::new(&map, geometry);
+        for (column, row) in [(0, 0), (255, 255), (256, 0), (511, 299), (17, 299)] {
+            let distance = (blocks.normal(column, row) - map.normal(column, row)).truncate();
+            assert!(
+                distance.abs().max_element() < geometry.grid.pitch,
+                "{column} {row}"
+            );
+        }
+    }
+}
+
+#[test]
+fn patterned_maps_are_found_again_quickly() {
+    // Sorting a gradient is a transposition: its cycles follow a pattern, which the pointers must not share.
+    let normals: Vec<Vec3> = (0..256 * 256)
+        .map(|i| {
+            Vec3::new(
+                (i % 256) as f32 / 300.0 - 0.4,
+                (i / 256) as f32 / 300.0 - 0.4,
+                1.0,
+            )
+        })
+        .collect();
+    let map = NormalMap::from_normals("gradient", 256, 256, &normals).unwrap();
+    let geometry = block_geometry((256, 256), 0.004, 1e-4, grid::bounds(&map, Vec3::truncate));
+    let blocks = Blocks::new(&map, geometry);
+    let longest = (0..256 * 256).map(|place| blocks.steps(place)).max().unwrap();
+    assert!(longest < 40 * blocks::STRIDE, "{longest} steps");
+}
+
+#[test]
+fn memory_is_within_its_budget() {
+    for alpha in [0.004, 0.02, 0.05, 0.16] {
+        let map = random_map(1024, 1024, 0.7, 3);
+        let compact = CompactBinMap::new(&map, model(alpha));
+        let per_texel = compact.structure_bytes() as f64 / 1024.0_f64.powi(2);
+        assert!(per_texel < 1.02 * BYTES_PER_TEXEL, "alpha {alpha}: {per_texel}");
+    }
+}
+
+#[test]
+fn the_number_of_threads_does_not_matter() {
+    let map = random_map(300, 200, 0.5, 9);
+    let query = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        let compact = pool.install(|| CompactBinMap::new(&map, model(0.02)));
+        let footprint = Footprint::new(300, 200, [0.4, 0.3], [0.3, 0.1], [-0.1, 0.4]);
+        (0..50)
+            .map(|i| compact.ndf(&footprint, Vec3::new(0.01 * i as f32 - 0.2, 0.1, 1.0).normalize()))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(query(1), query(3));
+}
