@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Generate the meshes, environments and normal maps of the shoes and kettle scenes into a cache folder.
+"""Generate the meshes, environments and normal maps of this folder's scenes into a cache folder.
 
     python mitsuba_scenes/generate.py [--cache DIR] [--map-resolution 2048] [--force]
 
@@ -16,6 +16,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +24,7 @@ SCENES_DIR = Path(__file__).resolve().parent
 if str(SCENES_DIR) not in sys.path:
     sys.path.insert(0, str(SCENES_DIR))
 
-from scene_assets import environment, kettle, maps, mesh, shoe
+from scene_assets import car_wheel, environment, kettle, maps, mesh, shoe, wing_mirror
 
 DEFAULT_CACHE = SCENES_DIR.parent / ".cache" / "scenes"
 MAPS = tuple(maps.RECIPES)
@@ -49,13 +50,14 @@ class Group:
         return digest.hexdigest()
 
 
-def map_file(name: str, resolution: int) -> str:
-    """File name of a normal map in the cache folder."""
-    return f"{name}_{resolution}.exr"
+def map_file(name: str, resolution: int | None = None) -> str:
+    """File name of a normal map in the cache folder; None: at its full resolution."""
+    return f"{name}_{resolution or maps.RECIPES[name].full_resolution}.exr"
 
 
-def _map_group(name: str, resolution: int) -> Group:
+def _map_group(name: str, resolution: int | None) -> Group:
     file = map_file(name, resolution)
+    resolution = resolution or maps.RECIPES[name].full_resolution
     return Group(
         name=f"{name}_{resolution}",
         files=(file,),
@@ -91,8 +93,8 @@ def _floor_group() -> Group:
     )
 
 
-def groups(map_resolution: int) -> list[Group]:
-    """All groups of files the two scenes need."""
+def groups(map_resolution: int | None = None) -> list[Group]:
+    """All groups of files that the scenes need."""
     return [
         *(_map_group(name, map_resolution) for name in MAPS),
         *(_image_group(name, environment.write_environment) for name in environment.STUDIOS),
@@ -100,6 +102,8 @@ def groups(map_resolution: int) -> list[Group]:
         _floor_group(),
         _mesh_group("kettle", kettle, kettle.PARTS),
         _mesh_group("shoe", shoe, shoe.PARTS),
+        _mesh_group("car_wheel", car_wheel, car_wheel.PARTS),
+        _mesh_group("wing_mirror", wing_mirror, wing_mirror.PARTS),
     ]
 
 
@@ -136,32 +140,37 @@ def generate_group(group: Group, cache: Path) -> None:
 
 def ensure_assets(
     cache_dir: str | os.PathLike | None = None,
-    map_resolution: int = maps.FULL_RESOLUTION,
+    map_resolution: int | None = None,
     force: bool = False,
     log: Callable[[str], None] = print,
 ) -> dict:
     """Generate what is missing or outdated in `cache_dir` (default: `.cache/scenes` of the repository).
 
-    Returns {"assets": folder, "maps": {"isotropic": path, "brushed": path}}. `map_resolution` in texels per side.
+    Returns {"assets": folder, "maps": {name: path}}, names as in `maps.RECIPES`. `map_resolution` in texels per side of
+    every map; None: each at its own full resolution.
     """
-    if map_resolution < 1:
+    if map_resolution is not None and map_resolution < 1:
         raise ValueError(f"map_resolution must be at least 1, got {map_resolution}")
     cache = Path(cache_dir) if cache_dir is not None else DEFAULT_CACHE
     cache = cache.resolve()
     cache.mkdir(parents=True, exist_ok=True)
-    for group in groups(map_resolution):
-        if force or not is_current(group, cache):
-            start = time.perf_counter()
-            generate_group(group, cache)
-            log(f"scene assets: {', '.join(group.files)} ({time.perf_counter() - start:.1f} s)")
+    missing = [group for group in groups(map_resolution) if force or not is_current(group, cache)]
+    start = time.perf_counter()
+    # Threads are enough: most of the time goes into numpy's loops over large arrays, which let others run.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for group, done in [(group, pool.submit(generate_group, group, cache)) for group in missing]:
+            done.result()
+            log(f"scene assets: {group.name}")
+    if missing:
+        log(f"scene assets: {len(missing)} groups of files made in {time.perf_counter() - start:.1f} s")
     return {"assets": cache, "maps": {name: cache / map_file(name, map_resolution) for name in MAPS}}
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description="Generate the assets of the shoes and kettle scenes.")
+    parser = argparse.ArgumentParser(description="Generate the assets of this folder's scenes.")
     parser.add_argument("--cache", type=Path, default=None, help=f"folder to write to (default {DEFAULT_CACHE})")
-    parser.add_argument("--map-resolution", type=int, default=maps.FULL_RESOLUTION, help="texels per side of the maps")
+    parser.add_argument("--map-resolution", type=int, help="texels per side of every map (default: each its own)")
     parser.add_argument("--force", action="store_true", help="generate everything again")
     arguments = parser.parse_args()
     assets = ensure_assets(arguments.cache, arguments.map_resolution, arguments.force)

@@ -320,7 +320,7 @@ def test_flags(rough_map, plugin):
 
 def test_description_and_log(rough_map):
     with captured_log(mi.LogLevel.Info) as lines:
-        glints = bsdf("glints_ibm", rough_map, alpha=0.04)
+        glints = bsdf("glints_ibm", rough_map, alpha=0.04, structure="paper")
     for fragment in (rough_map, "48 x 32", "bins = 59", "structure_bytes", "build_seconds"):
         assert fragment in str(glints)
     assert any("48 x 32" in line and "built in" in line for line in lines)

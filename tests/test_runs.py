@@ -15,7 +15,7 @@ import support
 from glints_harness import executors, files, jobs, plan, reference, render, runs, scenes, temporal
 from glints_harness.compare import Comparison
 from glints_harness.images import read_exr
-from glints_harness.methods import METHODS
+from glints_harness.methods import METHODS, choose
 from glints_harness.progress import Silent
 from mini import command, run_compare
 
@@ -164,6 +164,19 @@ def test_footprint_rules_are_for_methods_that_filter(mini, tmp_path):
     assert [chosen.rules(method) for method in chosen.methods] == [("sample", "pixel"), ("sample",), ("none",)]
     chosen = settings(mini, tmp_path, ("glints_ibm", "glints_direct", "normalmap"), footprints=("0.5",))
     assert [chosen.rules(method) for method in chosen.methods] == [("0.5",), ("0.5",), ("none",)]
+
+
+def test_a_sparse_method_has_few_points_unless_it_is_named(mini, tmp_path):
+    chosen = settings(mini, tmp_path, spps=(1, 4), times=(0.1,), times_with_build=(0.2,), sweep=(1.0,), frames=3)
+    sparse = METHODS["glints_ibm_paper"]
+    runs = plan.RunPlan(replace(chosen, methods=(*chosen.methods, sparse), footprints=("sample", "pixel"))).runs
+    mine = [run for run in runs if run.method == sparse.name]
+    points = {(run.spp, run.time_budget, run.budget_includes_build, run.lighting.footprint) for run in mine}
+    assert points == {(1, None, False, "sample"), (None, 0.1, False, "sample")}
+    assert {run.view.name for run in mine} == {"crop1", "crop2"} and all(run.view.frame is None for run in mine)
+    runs = plan.RunPlan(replace(chosen, methods=tuple(choose([sparse.name])))).runs
+    assert {run.spp for run in runs} >= {1, 4, None} and {run.view.name for run in runs} >= {"frame", "crop1"}
+    assert any(run.view.frame is not None for run in runs)
 
 
 class Once(executors.Local):

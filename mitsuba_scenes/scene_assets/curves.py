@@ -59,6 +59,12 @@ def resample(points: np.ndarray, count: int) -> np.ndarray:
     return np.stack([np.interp(target, length, points[:, k]) for k in range(points.shape[1])], axis=-1)
 
 
+def profile_curve(points: np.ndarray, count: int) -> np.ndarray:
+    """A smooth curve through points (n, 2), resampled at equal arc length; shape (count, 2)."""
+    knots = np.concatenate(([0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    return resample(spline(knots, points, np.linspace(0, knots[-1], 16 * count)), count)
+
+
 def rotation_y(angle: float) -> np.ndarray:
     """4x4 rotation about the vertical axis that turns +x towards -z."""
     c, s = np.cos(angle), np.sin(angle)

@@ -90,6 +90,31 @@ STUDIOS = {
             *_ring(7, 30, 0.8, 0.2, 20.0),
         ),
     ),
+    # Outdoors, and without the sun, which is a light of its own: a clear sky with thin clouds.
+    "wing_mirror_sky": Studio(
+        ground=(0.045, 0.042, 0.04),
+        horizon=(0.95, 0.80, 0.66),
+        zenith=(0.07, 0.15, 0.36),
+        softboxes=(
+            Softbox(-50, 34, 26, 9, 0.7, (1.0, 0.97, 0.93), 1.0),
+            Softbox(64, 22, 30, 6, 0.6, (1.0, 0.96, 0.92), 1.0),
+            Softbox(20, 52, 22, 10, 0.5, (1.0, 0.98, 0.96), 1.0),
+            Softbox(150, 30, 40, 12, 0.6, (1.0, 0.97, 0.94), 1.0),
+        ),
+        lamps=(),
+    ),
+    # Large softboxes; the small lamps are lights of their own.
+    "car_wheel_studio": Studio(
+        ground=(0.05, 0.05, 0.055),
+        horizon=(0.16, 0.175, 0.20),
+        zenith=(0.07, 0.08, 0.095),
+        softboxes=(
+            Softbox(-58, 26, 24, 36, 2.0, (0.90, 0.95, 1.0)),
+            Softbox(82, 20, 20, 36, 2.0, (1.0, 0.95, 0.88)),
+            Softbox(20, 70, 40, 14, 2.2, (1.0, 0.99, 0.97)),
+        ),
+        lamps=(),
+    ),
 }
 
 
@@ -169,6 +194,7 @@ class Pool:
 
 FLOORS = {
     "kettle_floor": Pool((0.40, 0.125, 0.055), (0.030, 0.008, 0.006), 48.0),
+    "car_wheel_floor": Pool((0.16, 0.17, 0.19), (0.012, 0.013, 0.016), 95.0),
     "shoes_floor": Pool((0.095, 0.021, 0.095), (0.014, 0.003, 0.020), 46.0),
 }
 

@@ -6,7 +6,7 @@ direction (u) goes round the body, round the lid and round the spout, a whole nu
 
 import numpy as np
 
-from .curves import resample, rotation_y, spline, tube, unit
+from .curves import profile_curve, resample, rotation_y, spline, tube, unit
 from .mesh import Mesh, arc_length, grid_mesh, merge
 
 COLUMNS = 192
@@ -28,12 +28,6 @@ BASE = np.array([(8.9, 0.0), (9.45, 0.08), (9.6, 0.4), (9.5, 0.8)])
 STEM = np.array([(0.9, 14.66), (0.62, 14.85), (0.55, 15.2), (0.62, 15.6)])
 FOOT = np.array([(1.2, -0.2), (1.2, 0.1), (1.08, 0.26), (0.7, 0.36), (0.0, 0.4)])  # where the handle stands
 KNOB = np.array([(0.3, 15.5), (0.9, 15.55), (1.55, 16.0), (1.72, 16.6), (1.4, 17.15), (0.7, 17.4), (0.0, 17.45)])
-
-
-def profile_curve(points: np.ndarray, count: int) -> np.ndarray:
-    """A smooth curve through profile points (radius, height), resampled at equal arc length; shape (count, 2)."""
-    knots = np.concatenate(([0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
-    return resample(spline(knots, points, np.linspace(0, knots[-1], 16 * count)), count)
 
 
 def revolve(profile: np.ndarray, tiles: int, columns: int = COLUMNS) -> Mesh:

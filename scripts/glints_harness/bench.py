@@ -16,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from . import provenance, render, timer
-from .cli import ROOT, number, scene_assets
+from .cli import ROOT, number, numbers, scene_assets
 from .files import write_json
 from .methods import METHODS
 from .progress import Display, console
@@ -26,8 +26,22 @@ from .scenes import FULL_SIZE, find_scenes
 ALPHA = 0.00707
 """Flake roughness of the paper's Figure 7."""
 
+MAPS = ("isotropic", "brushed")
+"""The maps of Figure 7. Scenes with a reduced plan are left out here."""
+
 WIDTHS = (1, 4, 16, 64, 256, 1024)
-"""Footprint widths in texels."""
+"""Footprint widths in texels, of the calls through Mitsuba. The Rust library's program has a list of its own."""
+
+QUICK = ("--alpha", str(ALPHA), "--footprint", "1,16,256,64x1", "--seconds", "0.01")
+"""Options of the Rust library's program with `--quick`."""
+
+PLUGINS = (
+    # plugin, its parameters, name in the records, calls
+    ("glints_ibm", {}, "ibm", ("eval", "sample", "pdf")),
+    ("glints_ibm", {"structure": "paper"}, "ibm_paper", ("eval", "sample", "pdf")),
+    ("glints_direct", {}, "direct", ("eval",)),
+)
+"""What is called through Mitsuba."""
 
 FRAME_SPP = 16
 
@@ -41,6 +55,8 @@ FRAMES = (
     ("normalmap", 8),
     ("glints_ibm", 1),
     ("glints_ibm", 8),
+    ("glints_ibm_paper", 1),
+    ("glints_ibm_paper", 8),
     ("glints_direct", 1),
     ("glints_direct", 8),
     ("glints_yan16_flat", 1),
@@ -67,13 +83,27 @@ LONGEST_FRAME = 120.0
 """Seconds; a frame that is predicted to take longer is left out, and one of a third of this is rendered once."""
 
 
+TARGETS = {
+    "ibm/memory": ("≤ 18 MB", 18e6),
+    "ibm/build": ("≤ 0.15 s", 0.15),
+    "ibm/eval/worst": ("≤ 3 µs", 3000),
+    "ibm/eval/median": ("≤ 1 µs", 1000),
+    "ibm/eval/worst_over_best": ("≤ 6", 6),
+    "ibm/ndf_error/worst": ("≤ 2 %", 0.02),
+}
+"""What the compact bin map is to reach on a map of `TARGET_SIDE` texels a side: text and largest value."""
+
+TARGET_SIDE = 2048
+
+
 def target(record):
     """(text, whether reached) of the target for a record, or None if there is none."""
     name, value, ratio, params = (record[key] for key in ("name", "value", "ratio", "params"))
-    if name == "ibm/memory":
+    if name in ("ibm/memory", "ibm/build") and record["baseline"].startswith("2021 paper"):
         return "≤ the paper's", ratio <= 1
-    if name == "ibm/build":
-        return "≤ 0.3 s", value <= 0.3
+    if name in TARGETS and params.get("side") == TARGET_SIDE:
+        limit, largest = TARGETS[name]
+        return limit, value <= largest
     if name == "ibm/three_calls" and "scene" in params:
         return "≤ 10 µs", value <= 10_000
     full = params.get("resolution") == FULL_SIZE
@@ -99,12 +129,12 @@ def make_record(name, value, unit, baseline, baseline_value, params):
     }
 
 
-def rust_records(maps, quick, say):
-    """The records of the Rust library's benchmark program, on every map."""
+def rust_records(maps, quick, sides, say):
+    """The records of the Rust library's benchmark program, on every map; memory at other sides of the maps, too."""
+    options = [*(QUICK if quick else ()), *(("--sides", ",".join(map(str, sides))) if sides else ())]
     records = []
     for label, path in maps.items():
         say(f"Rust library on the {label} map")
-        options = ["--alpha", str(ALPHA), "--width", "1,16,256", "--seconds", "0.01"] if quick else []
         records += run_rust(path, label, options)
     return records
 
@@ -119,7 +149,7 @@ def scene_records(scenes, say):
         width = statistics.median(loaded.glinting_pixels(scene.first_slot().element.get("id"), view))
         texels = width * scene.base_tiles * timer.texels_per_side(scene.normal_map)
         for tiling in (1, 8):
-            options = ["--alpha", str(scene.alpha), "--width", f"{texels * tiling:.4g}", "--methods", "ibm"]
+            options = ["--alpha", str(scene.alpha), "--footprint", f"{texels * tiling:.4g}", "--methods", "ibm"]
             for record in run_rust(scene.normal_map, scene.normal_map.stem, options):
                 if record["name"] == "ibm/three_calls":
                     record["params"].update(scene=scene.name, tiling=tiling)
@@ -148,15 +178,14 @@ def plugin_records(maps, quick, say):
     records = []
     for label, path in maps.items():
         side = timer.texels_per_side(path)
-        for plugin, short in (("glints_ibm", "ibm"), ("glints_direct", "direct")):
-            say(f"{plugin} on the {label} map")
-            bsdf = timer.glint_bsdf(plugin, path, ALPHA)
+        for plugin, parameters, short, calls in PLUGINS:
+            say(f"{short} on the {label} map")
+            bsdf = timer.glint_bsdf(plugin, path, ALPHA, **parameters)
             for width in WIDTHS[::2] if quick else WIDTHS:
                 interactions = max(32, min(4096, 2_000_000 // width**2)) if short == "direct" else 4096
                 plain = measure(stock, 0.0, 4096).eval_ns
                 timings = measure(bsdf, width / side, interactions, 1 if quick else 3)
                 params = {"map": label, "alpha": ALPHA, "footprint": width, "through": "Mitsuba"}
-                calls = ("eval",) if short == "direct" else ("eval", "sample", "pdf")
                 records += [
                     make_record(
                         f"{short}/{call}",
@@ -330,6 +359,12 @@ def parser():
     add = result.add_argument
     add("--res", type=number(int), help="width of the frames (default: 800, with --quick 200)")
     add("--quick", action="store_true", help="fewer footprints, one repeat, small frames: minutes become seconds")
+    add(
+        "--sides",
+        type=numbers(int),
+        help="sides in texels of further maps whose memory is counted: the scenes' cropped or tiled, 16 B a texel and more "
+        "while they are built (default: 1024,4096, with --quick none)",
+    )
     add("--only", choices=("rust", "plugins", "frames"), help="one of the three sources")
     add("--scene-dir", type=Path, default=ROOT / "mitsuba_scenes", help="folder of scene files with a glint slot")
     add("--max-depth", type=number(int), default=2, help="longest path of the frames (default: %(default)s, direct)")
@@ -345,12 +380,13 @@ def main(arguments=None):
     start = time.perf_counter()
     render.start()
     assets = scene_assets(options.cache)
-    maps = assets()["maps"]
-    scenes = find_scenes(options.scene_dir, ["all"], assets)
+    maps = {name: assets()["maps"][name] for name in MAPS}
+    scenes = [scene for scene in find_scenes(options.scene_dir, ["all"], assets) if scene.reduced is None]
     records = []
     with Display() as display:
         if options.only in (None, "rust"):
-            records += rust_records(maps, options.quick, display.say)
+            sides = options.sides or (() if options.quick else (1024, 4096))
+            records += rust_records(maps, options.quick, sides, display.say)
             records += scene_records(scenes, display.say)
         if options.only in (None, "plugins"):
             records += plugin_records(maps, options.quick, display.say)

@@ -50,9 +50,18 @@ def parser():
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     what = result.add_argument_group("what to compare").add_argument
-    what("--scene", default="all", help="name of a scene, several with commas, or all (default)")
+    what(
+        "--scene",
+        default="all",
+        help="name of a scene, several with commas, or all (default): then those that have a reduced plan in scenes.json "
+        "are compared by that",
+    )
     what("--scene-dir", type=Path, default=ROOT / "mitsuba_scenes", help="folder of scene files with a glint slot")
-    what("--methods", default=",".join(METHODS), help="names with commas (default: %(default)s)")
+    what(
+        "--methods",
+        help=f"names with commas (default: {','.join(METHODS)}; without being named, "
+        f"{', '.join(name for name, method in METHODS.items() if method.sparse)} at a few points only)",
+    )
     what("--tiling", type=numbers(float), default=(1.0, 8.0), help="factors on the scene's tiling (default: 1,8)")
     what(
         "--footprint",
@@ -200,7 +209,7 @@ def generator():
 def settings(options):
     """The `Settings` that the options ask for."""
     check_options(options)
-    methods = tuple(choose(options.methods.split(",")))
+    methods = tuple(METHODS.values() if options.methods is None else choose(options.methods.split(",")))
     check_plugins((*methods, *(SURFACES[method.surface] for method in methods)))
     limited = not (options.spp or options.time or options.time_with_build or options.dask)
     return Settings(

@@ -44,6 +44,8 @@ class Settings:
     """Width and height of the frame that the crops are cut from."""
     frame_size: int = 400
     frame_spp: int = 4
+    frame_methods: Sequence[str] | None = None
+    """Names of the methods that render the frame; None: all."""
     lighting: Lighting = field(default_factory=Lighting)
     """Of the crops: direct light, which is what the methods filter, unless asked for otherwise."""
     frame_depth: int = 3
@@ -67,6 +69,28 @@ class Settings:
     cache: Path = Path(".cache")
     """Folder of finished runs and references."""
 
+    def of(self, scene):
+        """These settings as far as they hold for one scene: fewer where it is reduced."""
+        reduced = scene.reduced
+        if reduced is None:
+            return self
+        methods = tuple(method for method in self.methods if method.name in reduced.methods)
+        return replace(
+            self,
+            methods=methods,
+            frame_methods=reduced.frame_methods,
+            tilings=self.tilings[: reduced.tilings] if methods else (),
+            spps=self.spps[: reduced.spps],
+            times=self.times[: reduced.times],
+            times_with_build=self.times_with_build[: reduced.times],
+            footprints=(self.footprints or ("sample",))[:1],
+        )
+
+    @property
+    def cases(self):
+        """(scene, tiling) of everything that is compared."""
+        return [(scene, tiling) for scene in self.scenes for tiling in self.of(scene).tilings]
+
     def lighting_of(self, view, rule="none"):
         """The integrator of a view, with a footprint rule."""
         depth = self.frame_depth if is_frame(view) else self.lighting.max_depth
@@ -77,7 +101,7 @@ class Settings:
         if not method.filters:
             return ("none",)
         if self.footprints is not None:
-            return tuple(self.footprints)
+            return tuple(self.footprints[:1] if method.sparse else self.footprints)
         return ("sample", "pixel") if method.name == "glints_ibm" else ("sample",)
 
     def views(self, scene):
@@ -94,7 +118,7 @@ class Settings:
         None outside of the first scene at the first tiling, nor if no method has the surface of their references.
         """
         wanted = (scene, tiling) == (self.scenes[0], self.tilings[0])
-        if not wanted or all(method.surface != "texels" for method in self.methods):
+        if not wanted or all(method.surface != "texels" or method.sparse for method in self.of(scene).methods):
             return []
         crop = self.first_crop(scene)
         crop = crop.middle(max(1, crop.crop[2] // 2))
@@ -147,16 +171,16 @@ class RunPlan:
     def __init__(self, settings):
         self.settings = settings
         self.main, self.sweep, self.sequence = [], [], []
-        for scene in settings.scenes:
-            for tiling in settings.tilings:
-                for method in settings.methods:
-                    self.main += self.main_runs(scene, tiling, method)
-        texels = [method for method in settings.methods if method.surface == "texels"]
+        for scene, tiling in settings.cases:
+            for method in settings.of(scene).methods:
+                self.main += self.main_runs(scene, tiling, method)
         first = settings.scenes[0]
-        for method in texels:
-            self.sequence += self.sequence_runs(first, method)
+        methods = [method for method in settings.of(first).methods if not method.sparse]
+        for method in methods:
+            if method.surface == "texels":
+                self.sequence += self.sequence_runs(first, method)
         for tiling in settings.sweep:
-            for method in settings.methods:
+            for method in methods:
                 self.sweep += self.sweep_runs(first, tiling, method)
 
     @property
@@ -166,7 +190,9 @@ class RunPlan:
 
     def main_runs(self, scene, tiling, method):
         """Few samples in the crops, the frame, equal time, more samples."""
-        settings = self.settings
+        settings = self.settings.of(scene)
+        if method.sparse:
+            settings = replace(settings, spps=settings.spps[:1], times_with_build=(), frame_methods=())
         frame, *crops = settings.views(scene)
         rules = settings.rules(method)
 
@@ -177,7 +203,8 @@ class RunPlan:
             return [run(crop, rule, spp, seed, **more) for rule in rules for crop in crops for seed in self.seeds()]
 
         few = [item for spp in settings.spps[:1] for item in crop_runs(spp)]
-        whole = [run(frame, rule, settings.frame_spp, FIRST_SEED) for rule in rules]
+        framed = settings.frame_methods is None or method.name in settings.frame_methods
+        whole = [run(frame, rule, settings.frame_spp, FIRST_SEED) for rule in rules if framed]
         more = [item for spp in settings.spps[1:] for item in crop_runs(spp)]
         timed = [item for budget in settings.times for item in crop_runs(time_budget=budget)]
         paid = [
@@ -238,6 +265,11 @@ class ReferenceKey:
         return f"{folder}/reference-{self.surface}{frame}.exr"
 
 
+def surfaces_of(methods):
+    """The surfaces that methods have, in the order of `SURFACES`."""
+    return [name for name in SURFACES if any(method.surface == name for method in methods)]
+
+
 def references(settings):
     """(key, share of a crop's time) of every reference, each once.
 
@@ -245,17 +277,15 @@ def references(settings):
     methods of other surfaces are there to be timed.
     """
     wanted = {}
-    surfaces = [name for name in SURFACES if any(method.surface == name for method in settings.methods)]
-    for scene in settings.scenes:
+    for scene, tiling in settings.cases:
         frame, *crops = settings.views(scene)
-        for tiling in settings.tilings:
-            for surface in surfaces:
-                share = 1.0 if surface == "texels" else MINOR_SHARE
-                wanted.update({ReferenceKey(scene.name, tiling, surface, crop): share for crop in crops})
-            wanted[ReferenceKey(scene.name, tiling, "texels", frame)] = MINOR_SHARE
-            for view in settings.sequence(scene, tiling):
-                wanted[ReferenceKey(scene.name, tiling, "texels", view)] = SEQUENCE_SHARE
+        for surface in surfaces_of(settings.of(scene).methods):
+            share = 1.0 if surface == "texels" else MINOR_SHARE
+            wanted.update({ReferenceKey(scene.name, tiling, surface, crop): share for crop in crops})
+        wanted[ReferenceKey(scene.name, tiling, "texels", frame)] = MINOR_SHARE
+        for view in settings.sequence(scene, tiling):
+            wanted[ReferenceKey(scene.name, tiling, "texels", view)] = SEQUENCE_SHARE
     first = settings.scenes[0]
-    for tiling in settings.sweep if "texels" in surfaces else ():
+    for tiling in settings.sweep if "texels" in surfaces_of(settings.of(first).methods) else ():
         wanted.setdefault(ReferenceKey(first.name, tiling, "texels", settings.first_crop(first)), MINOR_SHARE)
     return list(wanted.items())

@@ -6,13 +6,13 @@ The slot is a stock `<bsdf type="normalmap">` over `<bsdf type="roughconductor">
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from xml.etree import ElementTree as xml
 
 from . import maps
 from .files import digest_file, digest_text
-from .methods import Slot
+from .methods import Slot, choose
 
 FULL_SIZE = 800
 """Width and height in pixels of the frames in the paper's Figure 7; crops are given in pixels of such a frame."""
@@ -61,6 +61,38 @@ class View:
 
 
 @dataclass(frozen=True)
+class Reduced:
+    """What a comparison of all scenes has of one that is not asked for by name: entry `reduced` of `scenes.json`."""
+
+    methods: tuple
+    """Names."""
+    frame_methods: tuple
+    """Names of those that render the frame, too."""
+    crops: int
+    tilings: int
+    spps: int
+    times: int
+    """How many of the crops, and of the comparison's tilings, sample counts and time budgets: the first ones."""
+
+    @classmethod
+    def read(cls, entry, where):
+        """From an entry; `where` says in errors whose it is."""
+        names = [field.name for field in fields(cls)]
+        if sorted(entry) != sorted(names):
+            raise ValueError(f"{where}: reduced needs the entries {', '.join(names)}, and no others")
+        lists = ("methods", "frame_methods")
+        counts = {name: entry[name] for name in names if name not in lists}
+        wrong = [name for name, count in counts.items() if type(count) is not int or count < (name == "crops")]
+        if wrong:
+            raise ValueError(f"{where}: reduced has to give {', '.join(wrong)} as numbers, and crops as at least 1")
+        try:
+            chosen = {name: tuple(method.name for method in choose(entry[name])) for name in lists}
+        except ValueError as error:
+            raise ValueError(f"{where}: reduced: {error}") from error
+        return cls(**chosen, **counts)
+
+
+@dataclass(frozen=True)
 class Scene:
     """A scene file with a glint slot."""
 
@@ -70,6 +102,8 @@ class Scene:
     """The file's parameters (`<default>`), name to text, with the places of generated files put in."""
     crops: tuple
     """(x, y, width, height) in pixels of a frame of `FULL_SIZE` pixels."""
+    reduced: Reduced | None = None
+    """None: everything is compared."""
 
     @property
     def base_tiles(self):
@@ -180,8 +214,8 @@ def scene_digest(text):
 def find_scenes(folder, wanted, assets):
     """Scenes with a slot in `folder` and below, by file name.
 
-    `wanted` is a list of names, or ["all"]. `assets` is called without arguments when a scene needs generated files;
-    it returns {"assets": folder, "maps": {"isotropic": path, "brushed": path}}.
+    `wanted` is a list of names, or ["all"]: then scenes may be reduced. `assets` is called without arguments when a
+    scene needs generated files; it returns {"assets": folder, "maps": {name: path}}.
     """
     folder = Path(folder)
     files = {}
@@ -193,7 +227,8 @@ def find_scenes(folder, wanted, assets):
     if missing or not names:
         there = ", ".join(files) or "none"
         raise ValueError(f"no scene {', '.join(missing)} with a glint slot in {folder}; there are: {there}")
-    return [open_scene(files[name], folder, assets) for name in sorted(names, key=paper_order)]
+    found = [open_scene(files[name], folder, assets) for name in sorted(names, key=paper_order)]
+    return [reduce(scene, folder) for scene in found] if wanted == ["all"] else found
 
 
 def paper_order(name):
@@ -211,20 +246,35 @@ def open_scene(path, folder, assets):
     if not (path.parent / scene.normal_map).is_file():
         if "normalmap" not in values:
             raise ValueError(f"{path}: the normal map {scene.normal_map} does not exist")
-        values["normalmap"] = str(assets()["maps"][map_kind(scene.normal_map)])
+        generated = assets()["maps"]
+        values["normalmap"] = str(generated[map_kind(scene.normal_map, generated)])
     return scene
 
 
-def map_kind(path):
-    """Which generated map stands in for a map of this name."""
-    return "brushed" if "brushed" in path.stem else "isotropic"
+def map_kind(path, generated):
+    """Which of the generated maps stands in for a map of this name: one whose name is in it, or the isotropic one."""
+    return next((name for name in generated if name in path.stem), "isotropic")
+
+
+def listed(name, folder):
+    """What the folder's `scenes.json` says of a scene; empty if nothing."""
+    listing = Path(folder) / "scenes.json"
+    entry = json.loads(listing.read_text(encoding="utf-8")).get(name) if listing.is_file() else None
+    return entry if isinstance(entry, dict) else {}
 
 
 def find_crops(name, folder):
     """Crops from the folder's `scenes.json` if it has them, else the paper's, else two in the middle."""
-    listing = Path(folder) / "scenes.json"
-    if listing.is_file():
-        entry = json.loads(listing.read_text(encoding="utf-8")).get(name)
-        if isinstance(entry, dict) and "crops" in entry:
-            return tuple((*crop, *CROP_SIZE)[:4] for crop in entry["crops"])
+    entry = listed(name, folder)
+    if "crops" in entry:
+        return tuple((*crop, *CROP_SIZE)[:4] for crop in entry["crops"])
     return PAPER_CROPS.get(name, CENTRAL_CROPS)
+
+
+def reduce(scene, folder):
+    """A scene with the reduced plan that the folder's `scenes.json` may have for it."""
+    entry = listed(scene.name, folder).get("reduced")
+    if entry is None:
+        return scene
+    reduced = Reduced.read(entry, f"{Path(folder) / 'scenes.json'}: {scene.name}")
+    return replace(scene, crops=scene.crops[: reduced.crops], reduced=reduced)

@@ -144,7 +144,7 @@ class Results:
     temporal: list
     """`TemporalResult`s, the reference's first."""
     table_4: dict
-    """(scene, flake roughness) to what `render.STRUCTURE` names of an inverse bin map, at the paper's roughnesses."""
+    """(scene, method, flake roughness) to what `render.STRUCTURE` names of a bin map, at the paper's roughnesses."""
     left_out: list
     provenance: dict
     warnings: dict

@@ -64,6 +64,6 @@ def texels_per_side(path):
     return int(re.search(r"resolution = (\d+) x", str(glint_bsdf("glints_unfiltered", path, 0.01))).group(1))
 
 
-def glint_bsdf(plugin, path, alpha):
+def glint_bsdf(plugin, path, alpha, **parameters):
     """A glint BSDF of this project over a map of stock `normalmap`'s encoding."""
-    return mi.load_dict({"type": plugin, "filename": str(path), "encoding": "unsigned", "alpha": alpha})
+    return mi.load_dict({"type": plugin, "filename": str(path), "encoding": "unsigned", "alpha": alpha, **parameters})

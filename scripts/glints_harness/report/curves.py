@@ -2,7 +2,17 @@
 
 from ..summary import select
 from . import plots
-from .text import case_id, case_title, number, sample_text, seconds_text, short_label, view_title, with_interval
+from .text import (
+    case_id,
+    case_title,
+    number,
+    sample_text,
+    scene_title,
+    seconds_text,
+    short_label,
+    view_title,
+    with_interval,
+)
 
 METRIC_TITLES = {
     "rmse": "RMSE",
@@ -25,15 +35,14 @@ AXES = {
 def convergence_plots(results):
     """{(case id, view, metric, axis): `Plot`} of every crop."""
     found = {}
-    for scene in results.settings.scenes:
-        for tiling in results.settings.tilings:
-            mine = [item for item in select(results.summaries, scene=scene.name, tiling=tiling) if item.frame is None]
-            for view in dict.fromkeys(item.view for item in mine if item.view != "frame"):
-                points = [item for item in select(mine, view=view) if item.errors]
-                for metric in METRIC_TITLES:
-                    for axis in AXES if metric != "mean_error" else ("spp",):
-                        key = (case_id(scene.name, tiling), view, metric, axis)
-                        found[key] = convergence(points, scene.name, tiling, view, metric, axis)
+    for scene, tiling in results.settings.cases:
+        mine = [item for item in select(results.summaries, scene=scene.name, tiling=tiling) if item.frame is None]
+        for view in dict.fromkeys(item.view for item in mine if item.view != "frame"):
+            points = [item for item in select(mine, view=view) if item.errors]
+            for metric in METRIC_TITLES:
+                for axis in AXES if metric != "mean_error" else ("spp",):
+                    key = (case_id(scene.name, tiling), view, metric, axis)
+                    found[key] = convergence(points, scene.name, tiling, view, metric, axis)
     return {key: plot for key, plot in found.items() if plot.series}
 
 
@@ -95,7 +104,7 @@ def sweep_plots(results):
             measured = [item for item in mine if quantity == "time" or (item.errors and item.surface == "texels")]
             found[scene, quantity] = plots.Plot(
                 name=f"{scene}-{quantity}-over-tiling",
-                title=f"{scene.capitalize()}, {view_title(mine[0].view)}, {mine[0].spp} spp",
+                title=f"{scene_title(scene)}, {view_title(mine[0].view)}, {mine[0].spp} spp",
                 x_label="texture tiling (texels per pixel ∝ its square)",
                 y_label=label,
                 series=curves(measured, point),

@@ -14,7 +14,7 @@ from ..files import json_ready, write_text
 from ..summary import select
 from . import animation, curves, pictures, plots, tables, workers
 from .curves import AXES, METRIC_TITLES
-from .text import case_id, case_title, long_label, number, short_label
+from .text import case_id, case_title, long_label, number, scene_title, short_label
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -52,11 +52,7 @@ def write(results):
         precision=precision(),
         metrics=METRIC_TITLES,
         axes=AXES,
-        figure=[
-            figure_row(results, gallery, chosen, scene, tiling)
-            for scene in results.settings.scenes
-            for tiling in results.settings.tilings
-        ],
+        figure=[figure_row(results, gallery, chosen, scene, tiling) for scene, tiling in results.settings.cases],
         **page_tables(results),
         sweep_plots=[identity for identity in chosen if identity.startswith("sweep/")],
         largest_tiling=max((item.tiling for item in results.sweep), default=1),
@@ -138,7 +134,9 @@ def figure_row(results, gallery, chosen, scene, tiling):
     frame = next((view for view in case["views"] if view["name"] == "frame"), None)
     crops = [view for view in case["views"] if view is not frame]
     return {
-        "title": f"{scene.name.capitalize()}, texture tiling ×{tiling:g}",
+        "title": f"{scene_title(scene.name)}, texture tiling ×{tiling:g}",
+        "name": scene.name,
+        "reduced": scene.reduced is not None,
         "tiles": scene.base_tiles * tiling,
         "map": scene.normal_map.name,
         "alpha": number(scene.alpha, 4),
@@ -214,20 +212,19 @@ def page_tables(results):
 def error_cases(results):
     """The error tables of every scene and tiling, and the crops that have plots."""
     cases = []
-    for scene in results.settings.scenes:
-        for tiling in results.settings.tilings:
-            mine = select(results.summaries, scene=scene.name, tiling=tiling)
-            mine = [item for item in mine if item.frame is None and item.errors]
-            order = list(dict.fromkeys(map(long_label, mine)))
-            mine.sort(key=lambda item: (order.index(long_label(item)), item.view, item.time_budget or 0, item.spp))
-            cases.append(
-                {
-                    "id": case_id(scene.name, tiling),
-                    "title": case_title(scene.name, tiling),
-                    "views": sorted({item.view for item in mine if item.view != "frame"}),
-                    "tables": {metric: tables.error_table(results, mine, metric) for metric in METRIC_TITLES},
-                }
-            )
+    for scene, tiling in results.settings.cases:
+        mine = select(results.summaries, scene=scene.name, tiling=tiling)
+        mine = [item for item in mine if item.frame is None and item.errors]
+        order = list(dict.fromkeys(map(long_label, mine)))
+        mine.sort(key=lambda item: (order.index(long_label(item)), item.view, item.time_budget or 0, item.spp))
+        cases.append(
+            {
+                "id": case_id(scene.name, tiling),
+                "title": case_title(scene.name, tiling),
+                "views": sorted({item.view for item in mine if item.view != "frame"}),
+                "tables": {metric: tables.error_table(results, mine, metric) for metric in METRIC_TITLES},
+            }
+        )
     return cases
 
 

@@ -84,9 +84,8 @@ class Gallery:
 def gallery(results, pool):
     """All pictures of the report; their FLIP maps are computed in `pool` until `Gallery.finish`."""
     found = Gallery(pool)
-    for scene in results.settings.scenes:
-        for tiling in results.settings.tilings:
-            found.cases.append(case(results, found, scene, tiling))
+    for scene, tiling in results.settings.cases:
+        found.cases.append(case(results, found, scene, tiling))
     return found
 
 

@@ -20,6 +20,7 @@ from ..files import replacing, write_text
 
 STYLES = {
     "glints_ibm": ("#0072B2", "o", "-"),
+    "glints_ibm_paper": ("#994F00", "p", "-"),
     "glints_ibm_rough": ("#56B4E9", "P", "-"),
     "glints_yan16_flat": ("#D55E00", "X", "-"),
     "glints_yan16_curved": ("#E69F00", "s", "-"),
@@ -31,7 +32,7 @@ STYLES = {
 }
 """Colour, marker, line of each method; dashed and dotted: another reflectance model."""
 
-SPARE_STYLES = (("#F0E442", "h", "-"), ("#994F00", "p", "-"))
+SPARE_STYLES = (("#F0E442", "h", "-"), ("#4B0092", "<", "-"))
 
 INK, LINE, FAINT, NOISE = "#000000", "#d4d8dd", "#eceef1", "#dfe3e8"
 """Colours of text and axes, of the grid, and of the reference's noise. A page replaces them by its own scheme's."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 
 from .. import paper
+from ..structures import BIN_MAPS, bin_map_of
 from ..summary import select
 from ..tables import formula_bytes, mean_error_text
 from .curves import METRIC_TITLES
@@ -14,6 +15,7 @@ from .text import (
     method_label,
     number,
     sample_text,
+    scene_title,
     seconds_text,
     signed,
     view_title,
@@ -27,8 +29,21 @@ COLUMNS_OF_FIGURE_7 = {
 }
 """Methods by the paper's names for them, in its order."""
 
+COLUMNS_OF_TABLES = {
+    "glints_ibm": "Ours, compact",
+    "glints_ibm_paper": "Ours, published structure",
+    "glints_yan16_flat": "Yan (flat)",
+    "glints_yan16_curved": "Yan (curved)",
+    "glints_ibm_rough": "Ours, compact (rough)",
+}
+"""Methods of Tables 2 and 3: the paper's, its own in both structures."""
+
+ROWS_OF_TABLE_4 = {"glints_ibm": "compact", "glints_ibm_paper": "published structure"}
+"""What `structures.BIN_MAPS` are called in Table 4."""
+
 PRINTED_NAMES = {
     "glints_ibm": "Inverse bin map",
+    "glints_ibm_paper": "Inverse bin map",
     "glints_yan16_flat": "Yan flat",
     "glints_yan16_curved": "Yan curved",
     "glints_ibm_rough": "Inverse bin map (rough)",
@@ -97,26 +112,30 @@ def structures(results, scene):
 
 
 def table_2_or_3(results, quantity, ratio):
-    """Table 2 (`quantity` = structure_bytes) or 3 (build_seconds): ours, and the paper's number below.
+    """Table 2 (`quantity` = structure_bytes) or 3 (build_seconds): ours in both structures, and the paper's number below.
 
-    `ratio` is what the paper says of Yan's flat elements over its own method.
+    `ratio` is what the paper says of Yan's flat elements over its own method, in the scenes of its tables.
     """
     shown = bytes_text if quantity == "structure_bytes" else seconds_text
     rows = []
     for scene in results.settings.scenes:
         mine = structures(results, scene)
-        cells = [Cell(f"{scene.name.capitalize()} scene")]
-        for method in COLUMNS_OF_FIGURE_7:
+        printed = f"paper {ratio}" if scene.name in paper.TABLES_2_AND_3 else ""
+        cells = [Cell(f"{scene_title(scene.name)} scene")]
+        for method in COLUMNS_OF_TABLES:
             measured = getattr(mine[method], quantity) if method in mine else None
             cells.append(Cell(shown(measured), printed_text(scene.name, method, quantity)))
-        if {"glints_ibm", "glints_yan16_flat"} <= set(mine):
-            found = getattr(mine["glints_yan16_flat"], quantity) / getattr(mine["glints_ibm"], quantity)
-            cells.append(Cell(f"{number(found, 2)}×", f"paper {ratio}"))
-        else:
-            cells.append(Cell("–", f"paper {ratio}"))
+        cells += [Cell(flat_over(mine, name, quantity), printed) for name in BIN_MAPS]
         rows.append(cells)
-    headings = [Column(heading) for heading in COLUMNS_OF_FIGURE_7.values()]
-    return table([Column("", text=True), *headings, Column("Yan (flat) ÷ Ours")], rows)
+    headings = [*COLUMNS_OF_TABLES.values(), *(f"Yan (flat) ÷ {ROWS_OF_TABLE_4[name]}" for name in BIN_MAPS)]
+    return table([Column("", text=True), *map(Column, headings)], rows)
+
+
+def flat_over(mine, name, quantity):
+    """Yan's flat elements over a bin map."""
+    if not {name, "glints_yan16_flat"} <= set(mine):
+        return "–"
+    return f"{number(getattr(mine['glints_yan16_flat'], quantity) / getattr(mine[name], quantity), 2)}×"
 
 
 def printed_text(scene, method, quantity):
@@ -128,35 +147,38 @@ def printed_text(scene, method, quantity):
 
 
 def table_4(results):
-    """Bins and memory by flake roughness, at the paper's roughnesses and at those that were rendered."""
+    """Bins and memory of both bin maps by flake roughness, at the paper's roughnesses and at those that were rendered."""
     measured = {key: (item["bins"], item["structure_bytes"]) for key, item in results.table_4.items()}
     for scene in results.settings.scenes:
         found = structures(results, scene)
-        for method in results.settings.methods:
-            if method.name in found and found[method.name].bins is not None:
+        for method in results.settings.of(scene).methods:
+            if method.name in found and bin_map_of(method) is not None:
                 item = found[method.name]
-                measured[scene.name, method.parameters.get("alpha", scene.alpha)] = item.bins, item.structure_bytes
-    alphas = sorted({*paper.TABLE_4, *(alpha for _, alpha in measured)})
-    bins = {alpha: count for (_, alpha), (count, _) in measured.items()}
-    rows = [["bin resolution b²", *(bins_cell(bins.get(alpha), alpha) for alpha in alphas)]]
+                alpha = method.parameters.get("alpha", scene.alpha)
+                measured[scene.name, bin_map_of(method), alpha] = item.bins, item.structure_bytes
+    alphas = sorted({*paper.TABLE_4, *(alpha for _, _, alpha in measured)})
+    bins = {key[1:]: count for key, (count, _) in measured.items()}
+    rows = []
+    for name, title in ROWS_OF_TABLE_4.items():
+        rows.append([f"bin resolution b², {title}", *(bins_cell(bins.get((name, alpha)), alpha) for alpha in alphas)])
     for scene in results.settings.scenes:
-        name = scene.name
-        cells = (memory_cell(measured.get((name, alpha)), name, alpha) for alpha in alphas)
-        rows.append([f"{name.capitalize()} scene", *cells])
+        for name, title in ROWS_OF_TABLE_4.items():
+            cells = (memory_cell(measured.get((scene.name, name, alpha)), scene.name, alpha) for alpha in alphas)
+            rows.append([f"{scene_title(scene.name)} scene, {title}", *cells])
     return table([Column("Beckmann roughness α", text=True), *(Column(number(alpha)) for alpha in alphas)], rows)
 
 
 def bins_cell(bins, alpha):
     """Bins per side, measured and printed."""
-    printed = f"paper {paper.TABLE_4[alpha][0]}²" if alpha in paper.TABLE_4 else ""
+    printed = f"paper {paper.TABLE_4[alpha].bins}²" if alpha in paper.TABLE_4 else ""
     return Cell("–" if bins is None else f"{bins}²", printed)
 
 
 def memory_cell(measured, scene, alpha):
     """Memory, measured and printed; `measured` is a pair of bins and bytes, or None."""
     printed = ""
-    if alpha in paper.TABLE_4 and scene in ("shoes", "kettle"):
-        printed = f"paper {paper.TABLE_4[alpha][1 if scene == 'shoes' else 2]} MB"
+    if alpha in paper.TABLE_4 and scene in paper.TABLE_4[alpha].megabytes:
+        printed = f"paper {paper.TABLE_4[alpha].megabytes[scene]} MB"
     return Cell("–" if measured is None else bytes_text(measured[1]), printed)
 
 
@@ -246,7 +268,7 @@ def sweep_table(results):
     ]
     rows = [
         (
-            item.scene.capitalize(),
+            scene_title(item.scene),
             method_cell(item),
             f"×{item.tiling:g}",
             sample_text(item),

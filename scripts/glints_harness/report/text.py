@@ -79,6 +79,11 @@ def long_label(item):
     return method_label(item.method) + ("" if item.footprint == "none" else f" · footprint: {item.footprint}")
 
 
+def scene_title(scene):
+    """Name of a scene for people."""
+    return scene.replace("_", " ").capitalize()
+
+
 def case_id(scene, tiling):
     """Name of a scene at a tiling in files and links."""
     return f"{scene}-x{tiling:g}"
@@ -86,7 +91,7 @@ def case_id(scene, tiling):
 
 def case_title(scene, tiling):
     """Name of a scene at a tiling for people."""
-    return f"{scene.capitalize()} ×{tiling:g}"
+    return f"{scene_title(scene)} ×{tiling:g}"
 
 
 def view_title(view):
