@@ -9,6 +9,7 @@ use glam::Vec3;
 use crate::error::{Error, Result};
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
+use crate::hash::mix;
 use crate::methods::Method;
 use crate::microfacet::beckmann_g1;
 use crate::normal_map::{NormalMap, SlopeCovariance};
@@ -186,12 +187,9 @@ impl Brdf {
 /// the lobe's number for a given one through the first number, and has no structure that an image could show.
 pub(crate) fn four_uniforms([u1, u2, u3]: [f32; 3]) -> [f32; 4] {
     let word = |u: f32| u64::from(u.to_bits());
-    let mut z = word(u1)
+    let z = mix(word(u1)
         .wrapping_mul(0x9e37_79b9_7f4a_7c15)
-        .wrapping_add(word(u2) << 32 | word(u3));
-    z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^= z >> 31;
+        .wrapping_add(word(u2) << 32 | word(u3)));
     let uniform = |bits: u64| (bits & 0xff_ffff) as f32 * (1.0 / 16_777_216.0);
     [uniform(z >> 40), uniform(z >> 16), u2, u3]
 }

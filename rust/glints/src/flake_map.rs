@@ -20,6 +20,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::gtr::Gtr;
+use crate::hash::mix;
 use crate::normal_map::MIN_Z;
 
 /// Most texels per side: a map and its mask then take 4 GB.
@@ -152,11 +153,6 @@ impl Cells {
     /// 64 random bits: the finaliser of SplitMix64 over the counter of this cell and use.
     fn bits(&self, cell: u32, usage: Use) -> u64 {
         let counter = u64::from(cell) * 8 + usage as u64 + 1;
-        let mix = |mut z: u64| {
-            z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-            z ^ z >> 31
-        };
         // The seed is mixed first, so that neighbouring seeds do not give shifted maps.
         mix(mix(self.seed).wrapping_add(counter.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
     }

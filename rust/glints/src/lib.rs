@@ -18,6 +18,7 @@ pub mod footprint;
 pub mod gaussian_footprint;
 pub mod gtr;
 pub mod half_vector;
+mod hash;
 pub mod methods;
 pub mod microfacet;
 pub mod mip_map;

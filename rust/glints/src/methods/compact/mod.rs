@@ -66,6 +66,7 @@ use super::{Method, Reflection};
 use crate::flakes::FlakeModel;
 use crate::footprint::{Footprint, Parallelogram, Part};
 use crate::half_vector::DirectionPair;
+use crate::hash::mix;
 use crate::normal_map::NormalMap;
 use blocks::{Blocks, Geometry};
 use counts::{CountSum, Counts};
@@ -402,10 +403,7 @@ impl Method for CompactBinMap {
 
 /// A uniformly distributed texel of a rectangle, independent of where in the rectangle the point drawn with `u` lies.
 fn texel_of(rect: &Rect, u: [f32; 4]) -> (u32, u32) {
-    let mut z = u64::from(u[0].to_bits()) << 32 | u64::from(u[1].to_bits());
-    z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^= z >> 31;
+    let z = mix(u64::from(u[0].to_bits()) << 32 | u64::from(u[1].to_bits()));
     let pick =
         |bits: u64, low: u32, high: u32| low + (((bits & 0xffff_ffff) * u64::from(high - low)) >> 32) as u32;
     (

@@ -69,6 +69,7 @@ use crate::error::{Error, Result};
 use crate::footprint::Footprint;
 use crate::gaussian_footprint::{GaussianFootprint, Reach};
 use crate::half_vector::DirectionPair;
+use crate::hash::mix;
 use crate::normal_map::NormalMap;
 use kernel::{Kernel, apply};
 use tree::{Element, Tree};
@@ -399,10 +400,7 @@ impl Hash {
 
     fn uniform(&mut self) -> f64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ z >> 31) >> 11) as f64 * (1.0 / (1_u64 << 53) as f64)
+        (mix(self.0) >> 11) as f64 * (1.0 / (1_u64 << 53) as f64)
     }
 }
 
