@@ -26,6 +26,8 @@
 //!   thousandth of its length, if that is less), practically its limit.
 //! * **Invalid differentials** (infinite or NaN) count as zero edges.
 
+use std::ops::Range;
+
 use glam::DVec2;
 
 /// Longest edge of a footprint, in periods of the map.
@@ -245,6 +247,11 @@ impl Parallelogram {
         self.area
     }
 
+    /// Centre in texels.
+    pub fn center(&self) -> DVec2 {
+        self.center
+    }
+
     /// Edges in texels.
     pub fn edges(&self) -> [DVec2; 2] {
         self.edges
@@ -338,34 +345,27 @@ impl Parallelogram {
 
     /// Rows of the grid with cells of size `cell` that the parallelogram touches, in increasing order.
     pub fn spans(&self, cell: DVec2) -> impl Iterator<Item = Span> + use<> {
+        self.spans_of_rows(cell, i64::MIN..i64::MAX)
+    }
+
+    /// Those of [`Parallelogram::spans`] whose rows are in `rows`.
+    pub fn spans_of_rows(&self, cell: DVec2, rows: Range<i64>) -> impl Iterator<Item = Span> + use<> {
         let e = self.half_extents();
-        let first = ((self.center.y - e.y) / cell.y).floor() as i64;
-        let last = ((self.center.y + e.y) / cell.y).ceil() as i64;
-        let rows = Rows::new(self, cell);
-        (first..last).map(move |row| rows.span(row))
+        let first = ((self.center.y - e.y) / cell.y).floor().max(rows.start as f64) as i64;
+        let last = ((self.center.y + e.y) / cell.y).ceil().min(rows.end as f64) as i64;
+        let spans = Rows::new(self, cell);
+        (first..last).map(move |row| spans.span(row))
     }
 
     /// [`Parallelogram::spans`] over texels, cut to the map's `[0, width) x [0, height)`.
     pub fn texel_spans(&self, width: u32, height: u32) -> impl Iterator<Item = Span> + use<> {
-        self.spans_within((0, 0), (width, height))
-    }
-
-    /// [`Parallelogram::spans`] over texels, cut to the rectangle `[low, high)` of the map.
-    pub fn spans_within(&self, low: (u32, u32), high: (u32, u32)) -> impl Iterator<Item = Span> + use<> {
-        let e = self.half_extents();
-        let first = (self.center.y - e.y).floor().max(f64::from(low.1)) as i64;
-        let last = (self.center.y + e.y).ceil().min(f64::from(high.1)) as i64;
-        let (left, right) = (i64::from(low.0), i64::from(high.0));
-        let cut = move |(x0, x1): (i64, i64)| (x0.clamp(left, right), x1.clamp(left, right));
-        let rows = Rows::new(self, DVec2::ONE);
-        (first..last).map(move |row| {
-            let span = rows.span(row);
-            Span {
-                row,
+        let cut = move |(x0, x1): (i64, i64)| (x0.clamp(0, width.into()), x1.clamp(0, width.into()));
+        self.spans_of_rows(DVec2::ONE, 0..height.into())
+            .map(move |span| Span {
+                row: span.row,
                 touched: cut(span.touched),
                 inside: cut(span.inside),
-            }
-        })
+            })
     }
 
     /// About how many texels the parallelogram touches.

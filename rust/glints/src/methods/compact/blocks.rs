@@ -21,17 +21,16 @@
 //! **Query** Of every block that meets the footprint, the words of the few cells within reach of the half vector, eight at a
 //! time.
 
-use glam::{DVec2, Vec3};
 use rayon::prelude::*;
-use wide::{CmpGe, CmpLe, f32x8, u32x8};
+use wide::{CmpGe, f32x8, u32x8};
 
 use super::array::Array;
+use super::border::Border;
 use super::cover::Rect;
 use super::grid::Grid;
-use super::lobes::{Sums, bits, lifted};
-use super::packing::{GROUP, Packed, pack, to_float, units_per_group};
-use super::rows::lane_mask;
-use crate::footprint::Parallelogram;
+use super::lanes::{LANES, lane_mask};
+use super::lobes::Sums;
+use super::packing::{GROUP, Packed, pack, prefetch, to_float, units_per_group};
 use crate::normal_map::NormalMap;
 
 /// One in so many elements of the permutation has a pointer.
@@ -97,6 +96,14 @@ impl Offsets {
         match self {
             Self::Narrow(offsets) => offsets.bytes(),
             Self::Wide(offsets) => offsets.bytes(),
+        }
+    }
+
+    #[inline]
+    fn prefetch(&self, index: usize) {
+        match self {
+            Self::Narrow(offsets) => prefetch(offsets, index..index + 1),
+            Self::Wide(offsets) => prefetch(offsets, index..index + 1),
         }
     }
 }
@@ -273,42 +280,12 @@ impl Blocks {
             + self.pointers.bytes()
     }
 
-    /// Adds all texels of the block at a corner, each with the weight `weight`.
-    pub fn add_all(&self, rect: &Rect, weight: f32, sums: &mut Sums) {
-        let weights = f32x8::splat(weight);
-        self.for_each_near(&self.block_of(rect), sums, |sums, near, _| {
-            sums.add(near.lanes, near.x, near.y, weights);
-        });
-    }
-
-    /// Adds the texels of the block at a corner, each with its area in the region.
-    pub fn add(&self, region: &Parallelogram, rect: &Rect, sums: &mut Sums) {
-        let block = self.block_of(rect);
-        let places = Places::new(region, &block, self.place_mask());
-        self.for_each_near(&block, sums, |sums, near, words| {
-            let (lanes, weights) = places.weights(words, near.lanes);
-            sums.add(lanes, near.x, near.y, weights);
-        });
-    }
-
-    /// The normal of a texel, quantised.
-    pub fn normal(&self, column: u32, row: u32) -> Vec3 {
+    /// The cell of a texel's normal.
+    pub fn cell(&self, column: u32, row: u32) -> [u32; 2] {
         let block = self.geometry.block_at(column, row);
         let place = (row - block.y) * block.width + column - block.x;
         let entry = self.find(&block, place);
-        let p = self.geometry.grid.point(self.grid_cell(&block, entry));
-        lifted(p.x, p.y)
-    }
-
-    /// A normal, quantised.
-    pub fn quantised(&self, normal: Vec3) -> Vec3 {
-        let grid = &self.geometry.grid;
-        let p = grid.point(grid.cell(normal));
-        lifted(p.x, p.y)
-    }
-
-    fn block_of(&self, rect: &Rect) -> Block {
-        self.geometry.block_at(rect.low.0, rect.low.1)
+        self.grid_cell(&block, entry)
     }
 
     #[inline]
@@ -410,143 +387,253 @@ impl Blocks {
         let [_, cells, before] = self.extents[self.extents.len() - 1];
         block.index * (cells + before) as usize
     }
+}
 
-    /// Calls `visit` with the texels of a block that may be within reach, eight at a time, and their words.
-    #[inline]
-    fn for_each_near(&self, block: &Block, sums: &mut Sums, mut visit: impl FnMut(&mut Sums, &Near, u32x8)) {
-        let grid = &self.geometry.grid;
-        let bits = self.geometry.cell_bits;
-        let cell = grid.pitch * (1 << bits) as f32;
+/// Blocks of which the texels near a half vector are to be added.
+///
+/// What a block holds lies in three places far apart, each known from the one before. Blocks wait for each other here, and
+/// ask for what they will read before the first is read.
+pub struct Reader<'a> {
+    blocks: &'a Blocks,
+    /// The half vector's projection and the reach, in cells.
+    center: [f32; 2],
+    reach: f32,
+    asked: [Asked; BATCH],
+    asked_len: usize,
+    runs: [Run; RUNS],
+    runs_len: usize,
+}
+
+const BATCH: usize = 16;
+const RUNS: usize = 32;
+
+/// A block, and the weight of its texels if all have the same; otherwise each has its area in the footprint.
+#[derive(Clone, Copy)]
+struct Asked {
+    block: Block,
+    weight: Option<f32>,
+}
+
+/// Neighbouring cells of one row of cells in a block: their texels lie one behind the other.
+#[derive(Clone, Copy, Default)]
+struct Run {
+    asked: u32,
+    /// Texels in the sorted order of the block.
+    begin: u32,
+    end: u32,
+    /// First texel of the row of cells; indices of the offsets of the cells behind the first, and of the one behind the
+    /// last.
+    row: u32,
+    next: u32,
+    last: u32,
+    /// Corner of the first cell, in cells of the grid.
+    x0: f32,
+    y0: f32,
+}
+
+impl<'a> Reader<'a> {
+    pub fn new(blocks: &'a Blocks, sums: &Sums) -> Self {
+        let grid = &blocks.geometry.grid;
+        let cell = grid.pitch * (1 << blocks.geometry.cell_bits) as f32;
         let center = (sums.query.half.truncate() - grid.low) / cell;
-        let reach = sums.reach() / cell;
-        let count = self.geometry.cell_rows();
-        let rows = &self.rows[block.index * (count + 1)..][..=count];
-        let base = self.cell_base(block);
-        let first_row = (center.y - reach).max(0.0) as usize;
-        let last_row = ((center.y + reach).max(-1.0) + 1.0) as usize;
-        for row in first_row..last_row.min(count) {
-            // Nearest distance of the row of cells to the centre, and what is left of the reach along it.
-            let dy = (row as f32 - center.y).max(center.y - row as f32 - 1.0).max(0.0);
-            let half = (reach * reach - dy * dy).max(0.0).sqrt();
-            let [first, cells, before] = self.extents[row];
-            let start = ((center.x - half).max(0.0) as u32).clamp(first, first + cells) - first;
-            let end = ((center.x + half).max(-1.0) as i32 + 1).clamp(first as i32, (first + cells) as i32)
-                as u32
-                - first;
-            let offset = |cell: u32| {
-                if cell < cells {
-                    rows[row] as usize + self.offsets.get(base + (before + cell) as usize)
-                } else {
-                    rows[row + 1] as usize
-                }
-            };
-            let y0 = f32x8::splat(((row as u32) << bits) as f32);
-            let mut begin = if start < end { offset(start) } else { 0 };
-            for cell in start..end {
-                let finish = offset(cell + 1);
-                let x0 = f32x8::splat(((first + cell) << bits) as f32);
-                self.visit_run(block, (begin, finish), (x0, y0), sums, &mut visit);
-                begin = finish;
-            }
+        Self {
+            blocks,
+            center: center.to_array(),
+            reach: sums.reach() / cell,
+            asked: [Asked {
+                block: blocks.geometry.block(0),
+                weight: None,
+            }; BATCH],
+            asked_len: 0,
+            runs: [Run::default(); RUNS],
+            runs_len: 0,
         }
     }
 
+    /// Adds the texels of the block at a corner, all with a weight, or each with its area.
+    pub fn add(&mut self, rect: &Rect, weight: Option<f32>, border: Option<&mut Border>, sums: &mut Sums) {
+        let block = self.blocks.geometry.block_at(rect.low.0, rect.low.1);
+        let base = self.blocks.cell_base(&block);
+        let rows = block.index * (self.blocks.geometry.cell_rows() + 1);
+        for row in self.rows() {
+            let [first, cells, before] = self.blocks.extents[row];
+            let (start, _) = self.columns(row, first, cells);
+            self.blocks.offsets.prefetch(base + (before + start) as usize);
+        }
+        prefetch(
+            &self.blocks.rows,
+            rows + self.rows().start..rows + self.rows().end + 1,
+        );
+        self.asked[self.asked_len] = Asked { block, weight };
+        self.asked_len += 1;
+        if self.asked_len == BATCH {
+            self.flush(border, sums);
+        }
+    }
+
+    /// Adds what waits. To be called before the border changes.
+    pub fn flush(&mut self, mut border: Option<&mut Border>, sums: &mut Sums) {
+        for index in 0..self.asked_len {
+            for row in self.rows() {
+                self.find_run(index, row);
+                if self.runs_len == RUNS {
+                    self.read(border.as_deref_mut(), sums);
+                }
+            }
+        }
+        self.read(border, sums);
+        self.asked_len = 0;
+    }
+
+    /// Rows of cells within reach.
     #[inline]
-    fn visit_run(
+    fn rows(&self) -> std::ops::Range<usize> {
+        let (y, reach) = (self.center[1], self.reach);
+        let first = (y - reach).max(0.0) as usize;
+        let end = ((y + reach).max(-1.0) + 1.0) as usize;
+        first..end.min(self.blocks.geometry.cell_rows())
+    }
+
+    /// Of the cells that a row of cells has, `cells` from `first` on, those within reach: from the first one on.
+    #[inline]
+    fn columns(&self, row: usize, first: u32, cells: u32) -> (u32, u32) {
+        let [x, y] = self.center;
+        // Nearest distance of the row of cells to the centre, and what is left of the reach along it.
+        let dy = (row as f32 - y).max(y - row as f32 - 1.0).max(0.0);
+        let half = (self.reach * self.reach - dy * dy).max(0.0).sqrt();
+        let start = ((x - half).max(0.0) as u32).clamp(first, first + cells) - first;
+        let end =
+            ((x + half).max(-1.0) as i32 + 1).clamp(first as i32, (first + cells) as i32) as u32 - first;
+        (start, end)
+    }
+
+    #[inline]
+    fn find_run(&mut self, asked: usize, row: usize) {
+        let blocks = self.blocks;
+        let block = &self.asked[asked].block;
+        let [first, cells, before] = blocks.extents[row];
+        let (start, end) = self.columns(row, first, cells);
+        if start >= end {
+            return;
+        }
+        let rows = blocks.rows_of(block);
+        let next = blocks.cell_base(block) + (before + start) as usize + 1;
+        let offset = |cell: u32| {
+            if cell < cells {
+                rows[row] + blocks.offsets.get(next + (cell - start) as usize - 1) as u32
+            } else {
+                rows[row + 1]
+            }
+        };
+        let bits = blocks.geometry.cell_bits;
+        let run = Run {
+            asked: asked as u32,
+            begin: offset(start),
+            end: offset(end),
+            row: rows[row],
+            next: next as u32,
+            last: next as u32 + (end - start) - 1,
+            x0: ((first + start) << bits) as f32,
+            y0: ((row as u32) << bits) as f32,
+        };
+        if run.begin >= run.end {
+            return;
+        }
+        let groups = blocks.starts[block.index] as usize;
+        blocks
+            .words
+            .prefetch(groups + run.begin as usize / GROUP..groups + (run.end as usize).div_ceil(GROUP));
+        self.runs[self.runs_len] = run;
+        self.runs_len += 1;
+    }
+
+    /// Reads all runs.
+    fn read(&mut self, mut border: Option<&mut Border>, sums: &mut Sums) {
+        for run in &self.runs[..self.runs_len] {
+            let Asked { block, weight } = &self.asked[run.asked as usize];
+            match (weight, border.as_deref_mut()) {
+                (&Some(weight), _) => self.blocks.for_each_near(block, run, sums, |sums, near, _| {
+                    sums.add_alike(near.lanes, near.x, near.y, weight);
+                }),
+                (None, Some(border)) => self.blocks.add_cut(block, run, border, sums),
+                (None, None) => {}
+            }
+        }
+        self.runs_len = 0;
+    }
+}
+
+impl Blocks {
+    /// Adds the texels of a run, each with its area in the footprint.
+    fn add_cut(&self, block: &Block, run: &Run, border: &mut Border, sums: &mut Sums) {
+        let (left, top) = border.place(block.x, block.y);
+        let (width, inv_width) = (block.width as f32, 1.0 / block.width as f32);
+        let place_mask = u32x8::splat(self.place_mask());
+        self.for_each_near(block, run, sums, |sums, near, words| {
+            let place = to_float(words & place_mask);
+            let row = ((place + 0.5) * inv_width).floor();
+            let column = place - row * width;
+            let (columns, rows) = (column + left, row + top);
+            let (touched, inside) = border.sides(columns, rows);
+            sums.add_alike(near.lanes & inside, near.x, near.y, 1.0);
+            let cut = near.lanes & touched & !inside;
+            if cut != 0 {
+                border.add(cut, [near.x, near.y], [columns, rows], sums);
+            }
+        });
+    }
+
+    /// Calls `visit` with the texels of a run, eight at a time, and their words.
+    #[inline(always)]
+    fn for_each_near(
         &self,
         block: &Block,
-        (begin, end): (usize, usize),
-        (x0, y0): (f32x8, f32x8),
+        run: &Run,
         sums: &mut Sums,
-        visit: &mut impl FnMut(&mut Sums, &Near, u32x8),
+        mut visit: impl FnMut(&mut Sums, &Near, u32x8),
     ) {
-        let Geometry {
-            side_bits,
-            cell_bits,
-            grid,
-            ..
-        } = &self.geometry;
-        let rest = u32x8::splat((1 << cell_bits) - 1);
-        let shift = 2 * side_bits;
+        let bits = self.geometry.cell_bits;
+        let (rest, shift) = (u32x8::splat((1 << bits) - 1), 2 * self.geometry.side_bits);
+        let cell = (1 << bits) as f32;
         let start = self.starts[block.index] as usize;
+        let (begin, end) = (run.begin as usize, run.end as usize);
+        let y0 = f32x8::splat(run.y0);
+        let mut x0 = f32x8::splat(run.x0);
+        let mut next = run.next as usize;
+        let boundary = |next: usize| (run.row as usize) + self.offsets.get(next);
+        let mut cell_end = if next < run.last as usize {
+            boundary(next)
+        } else {
+            end
+        };
         for group in begin / GROUP..end.div_ceil(GROUP) {
+            let first = group * GROUP;
             let words = self.words.group(start + group);
-            let x = to_float(words >> shift & rest) + x0;
-            let y = to_float(words >> (shift + cell_bits) & rest) + y0;
-            let (x, y) = (grid.middle(0, x), grid.middle(1, y));
-            let lanes = sums.near(x, y) & lane_mask((begin as i64, end as i64), (group * GROUP) as i64);
-            if lanes != 0 {
-                visit(sums, &Near { lanes, x, y }, words);
+            let mut lanes_x0 = x0;
+            while cell_end < end.min(first + GROUP) {
+                let behind = LANES.cmp_ge(f32x8::splat((cell_end - first) as f32));
+                lanes_x0 += behind & f32x8::splat(cell);
+                x0 += f32x8::splat(cell);
+                next += 1;
+                cell_end = if next < run.last as usize {
+                    boundary(next)
+                } else {
+                    end
+                };
             }
+            let x = to_float(words >> shift & rest) + lanes_x0;
+            let y = to_float(words >> (shift + bits) & rest) + y0;
+            let lanes = sums.near(x, y) & lane_mask((begin as i64, end as i64), first as i64);
+            visit(sums, &Near { lanes, x, y }, words);
         }
     }
 }
 
-/// Projected normals of which those in `lanes` may be within reach.
+/// Cells of normals of which those in `lanes` may be within reach.
 struct Near {
     lanes: u32,
     x: f32x8,
     y: f32x8,
-}
-
-/// A region seen from a block: which places lie inside it.
-struct Places<'a> {
-    region: &'a Parallelogram,
-    corner: (u32, u32),
-    width: f32,
-    inv_width: f32,
-    place_mask: u32,
-    /// Of s and t: gradient, value at the centre of the block's first texel, and half the variation over a texel.
-    slabs: [(f32, f32, f32, f32); 2],
-}
-
-impl<'a> Places<'a> {
-    fn new(region: &'a Parallelogram, block: &Block, place_mask: u32) -> Self {
-        let first = DVec2::new(f64::from(block.x) + 0.5, f64::from(block.y) + 0.5);
-        let slabs = region.slabs_at(first).map(|(gradient, value)| {
-            // Single precision places a texel to 1e-4 of a texel: what is nearer to the border is left to the exact area.
-            let variation = (0.5 + 2e-4) * (gradient.x.abs() + gradient.y.abs());
-            (
-                gradient.x as f32,
-                gradient.y as f32,
-                value as f32,
-                variation as f32,
-            )
-        });
-        Self {
-            region,
-            corner: (block.x, block.y),
-            width: block.width as f32,
-            inv_width: 1.0 / block.width as f32,
-            place_mask,
-            slabs,
-        }
-    }
-
-    /// Which of the texels of eight words are not outside the region, and their areas in it.
-    #[inline]
-    fn weights(&self, words: u32x8, lanes: u32) -> (u32, f32x8) {
-        let place = to_float(words & u32x8::splat(self.place_mask));
-        let y = ((place + 0.5) * self.inv_width).floor();
-        let x = place - y * self.width;
-        let (mut inside, mut outside) = (u32::MAX, 0);
-        for (gx, gy, value, variation) in self.slabs {
-            let s = x
-                .mul_add(f32x8::splat(gx), y.mul_add(f32x8::splat(gy), f32x8::splat(value)))
-                .abs();
-            inside &= (s + variation).cmp_le(f32x8::splat(0.5)).move_mask() as u32;
-            outside |= (s - variation).cmp_ge(f32x8::splat(0.5)).move_mask() as u32;
-        }
-        let mut weights = f32x8::ONE;
-        for k in bits(lanes & !inside & !outside) {
-            let (column, row) = (
-                self.corner.0 + x.as_array_ref()[k] as u32,
-                self.corner.1 + y.as_array_ref()[k] as u32,
-            );
-            weights.as_array_mut()[k] = self.region.texel_overlap(column, row) as f32;
-        }
-        (lanes & !outside, weights)
-    }
 }
 
 /// Where one block is written.

@@ -9,7 +9,7 @@ use super::blocks::{Block, Blocks, Geometry};
 use super::counts;
 use super::grid::Grid;
 use super::packing::WIDTHS;
-use super::rows;
+use super::tiles;
 use crate::normal_map::MAX_SIDE;
 
 /// What is wrong.
@@ -38,10 +38,10 @@ fn grid(grid: &Grid) -> Checked<()> {
     })
 }
 
-/// A grid of [`rows`].
-pub fn row_grid(cells: &Grid) -> Checked<()> {
+/// A grid of [`tiles`].
+pub fn tile_grid(cells: &Grid) -> Checked<()> {
     grid(cells)?;
-    demand(rows::fits(cells), || {
+    demand(tiles::lower_bits(cells).is_some(), || {
         format!("{:?} cells take more than 32 bits", cells.size)
     })
 }

@@ -22,11 +22,18 @@ use wide::{CmpLe, f32x8};
 use super::array::Array;
 use super::cover::{Node, Tree};
 use super::grid::Grid;
-use super::lobes::{LANES, Lobe, Normals, Query, Sums};
+use super::lanes::LANES;
+use super::lobes::{Lobe, Normals, Sums};
+use super::packing::{prefetch, to_float, widened};
 
-/// Width of a bin in standard deviations of a lobe, `alpha / sqrt 2`: one of them in angle; the paper has 1.2 (Eq. 16 of Atanasov et al.
-/// 2021). Wider ones show through the lobes that are left.
+/// Width of a bin in standard deviations of a lobe, `alpha / sqrt 2`; the paper has 1.2 (Eq. 16 of Atanasov et al. 2021).
+/// Wider ones show through the lobes that are left.
 const BIN_WIDTH: f64 = 0.7;
+
+/// The same for flakes rougher than [`CURVED`], over whose lobes the projection is not linear: what is left of that grows
+/// with the square of the width.
+const NARROW_BIN_WIDTH: f64 = 0.5;
+const CURVED: f32 = 0.1;
 
 /// Least share of the squared roughness that a bin's lobe keeps.
 const LEAST_SHARE: f32 = 0.2;
@@ -37,6 +44,12 @@ pub const PADDING: usize = 32;
 /// Rows and groups of eight columns of bins that a lobe may reach.
 const ROWS: usize = 24;
 const COLUMNS: usize = 3;
+
+/// Bins along a side of the squares over which distributions are compared.
+const SQUARE: usize = 4;
+
+/// Bound of the relative deviation of a node's part from the node.
+const LARGEST_DEVIATION: f64 = 1.0;
 
 /// See the module.
 pub struct Counts {
@@ -63,6 +76,16 @@ impl Level {
     }
 
     #[inline]
+    fn prefetch(&self, start: usize, count: usize) {
+        let range = start..start + count;
+        match self {
+            Self::U8(counts) => prefetch(counts, range),
+            Self::U16(counts) => prefetch(counts, range),
+            Self::U32(counts) => prefetch(counts, range),
+        }
+    }
+
+    #[inline]
     fn get(&self, index: usize) -> u32 {
         match self {
             Self::U8(counts) => counts[index].into(),
@@ -80,7 +103,12 @@ pub fn project(normal: Vec3) -> Vec2 {
 
 /// Width of the bins over the projection.
 pub fn bin_width(alpha: f32) -> f64 {
-    BIN_WIDTH * f64::from(alpha) / std::f64::consts::SQRT_2
+    let width = if alpha > CURVED {
+        NARROW_BIN_WIDTH
+    } else {
+        BIN_WIDTH
+    };
+    width * f64::from(alpha) / std::f64::consts::SQRT_2
 }
 
 /// The bins of normals whose projections lie between two bounds: as wide as [`bin_width`], and one more on each side, for
@@ -155,16 +183,72 @@ impl Counts {
         self.levels.iter().flatten().map(Level::bytes).sum()
     }
 
-    /// Share of the map's texels within reach of a half vector that one of them reflects at; zero without counts.
-    pub fn share(&self, tree: &Tree, lobe: &Lobe) -> f64 {
-        let Some(Some(root)) = self.levels.get(tree.levels() - 1) else {
-            return 0.0;
-        };
-        let counts = || (0..self.stride()).map(|bin| f64::from(root.get(bin)));
-        let concentration = counts().map(|n| n * n).sum::<f64>() / counts().sum::<f64>().powi(2).max(1.0);
-        // A solid angle is twice its projection's area.
-        let bins = 0.5 * std::f64::consts::PI * f64::from(lobe.reach() / self.bins.pitch).powi(2);
-        (concentration * bins).min(1.0)
+    /// How much the distribution of a node's part deviates from the node's, relatively, for the nodes of each level: that of
+    /// its quarters, over squares of bins about as large as a lobe. Quarters that have no counts are taken to deviate twice
+    /// as much as those of the next level, as by chance.
+    pub fn deviations(&self, tree: &Tree) -> Vec<f64> {
+        let mut deviations = vec![LARGEST_DEVIATION; tree.levels()];
+        for (below, pair) in self.levels.windows(2).enumerate() {
+            if let [Some(finer), Some(level)] = pair {
+                let measured = self.deviation(tree, below + 1, level, finer);
+                deviations[below + 1] = measured.min(LARGEST_DEVIATION);
+            }
+        }
+        for index in (0..tree.levels() - 1)
+            .rev()
+            .filter(|&index| index == 0 || !self.has(index - 1))
+        {
+            deviations[index] = (2.0 * deviations[index + 1]).min(LARGEST_DEVIATION);
+        }
+        deviations
+    }
+
+    /// `sqrt 3` times that of a node's halves, which is as for quarters where texels are independent. Where left and right
+    /// halves deviate otherwise than upper and lower ones, streaks make neighbours alike: the greater, times the root of its
+    /// ratio to the lesser.
+    fn deviation(&self, tree: &Tree, index: usize, level: &Level, finer: &Level) -> f64 {
+        let nodes = tree.nodes(index);
+        // Few nodes tell; a prime number of nodes apart, so that no pattern of the map is met.
+        let step = [1, 3, 7, 17, 61, 251]
+            .into_iter()
+            .rfind(|step| step * 64 <= nodes)
+            .unwrap_or(1);
+        let sums: Vec<[f64; 3]> = (0..nodes.div_ceil(step))
+            .into_par_iter()
+            .filter_map(|k| {
+                let node = tree.node(index, k * step);
+                let children: Vec<Node> = tree.children(&node).collect();
+                let [a, b, c, _]: [Vec<f64>; 4] = children
+                    .iter()
+                    .map(|child| self.squares(finer, tree.index(child)))
+                    .collect::<Vec<_>>()
+                    .try_into()
+                    .ok()?;
+                let whole = self.squares(level, tree.index(&node));
+                let difference = |one: &[f64], other: &[f64]| -> f64 {
+                    let halves = one.iter().zip(other).zip(&whole);
+                    halves
+                        .map(|((one, other), whole)| (2.0 * (one + other) - whole).abs())
+                        .sum()
+                };
+                Some([difference(&a, &b), difference(&a, &c), whole.iter().sum()])
+            })
+            .collect();
+        let total = |k: usize| sums.iter().map(|sum| sum[k]).sum::<f64>();
+        let (greater, lesser) = (total(0).max(total(1)), total(0).min(total(1)));
+        (3.0 * greater / lesser.max(1e-9)).sqrt() * greater / total(2).max(1.0)
+    }
+
+    /// Counts of a node over squares of bins.
+    fn squares(&self, level: &Level, node: usize) -> Vec<f64> {
+        let [columns, rows] = self.bins.size.map(|side| side as usize);
+        let stride = columns.div_ceil(SQUARE);
+        let mut sums = vec![0.0; stride * rows.div_ceil(SQUARE)];
+        for (y, x) in (0..rows).flat_map(|y| (0..columns).map(move |x| (y, x))) {
+            let count = level.get(node * self.stride() + y * columns + x);
+            sums[y / SQUARE * stride + x / SQUARE] += f64::from(count);
+        }
+        sums
     }
 
     fn stride(&self) -> usize {
@@ -251,8 +335,12 @@ pub struct CountSum<'a> {
     rows: usize,
     columns: usize,
     sums: [[f32x8; COLUMNS]; ROWS],
-    used: bool,
+    /// Nodes whose counts are on their way from memory: level, first count, weight.
+    asked: [(usize, usize, f32); BATCH],
+    asked_len: usize,
 }
+
+const BATCH: usize = 16;
 
 impl<'a> CountSum<'a> {
     pub fn new(counts: &'a Counts, half: Vec3, reach: f32) -> Self {
@@ -273,7 +361,8 @@ impl<'a> CountSum<'a> {
             rows: rows.len().min(ROWS),
             columns: columns.len().div_ceil(8).min(COLUMNS),
             sums: [[f32x8::ZERO; COLUMNS]; ROWS],
-            used: false,
+            asked: [(0, 0, 0.0); BATCH],
+            asked_len: 0,
         }
     }
 
@@ -289,35 +378,46 @@ impl<'a> CountSum<'a> {
         }
         let stride = self.counts.bins.size[0] as usize;
         let start = tree.index(node) * self.counts.stride() + self.first.1 * stride + self.first.0;
-        let weight = f32x8::splat(weight);
-        match level {
-            Level::U8(counts) => self.add_rows(&counts[start..], stride, weight, |c| c.into()),
-            Level::U16(counts) => self.add_rows(&counts[start..], stride, weight, |c| c.into()),
-            Level::U32(counts) => self.add_rows(&counts[start..], stride, weight, |c| c as i32 as f32),
+        for row in 0..self.rows {
+            level.prefetch(start + row * stride, 8 * self.columns);
         }
-        self.used = true;
+        self.asked[self.asked_len] = (node.level, start, weight);
+        self.asked_len += 1;
+        if self.asked_len == BATCH {
+            self.read();
+        }
+    }
+
+    fn read(&mut self) {
+        let stride = self.counts.bins.size[0] as usize;
+        for index in 0..self.asked_len {
+            let (level, start, weight) = self.asked[index];
+            let weight = f32x8::splat(weight);
+            match &self.counts.levels[level] {
+                Some(Level::U8(counts)) => self.add_rows(&counts[start..], stride, weight),
+                Some(Level::U16(counts)) => self.add_rows(&counts[start..], stride, weight),
+                Some(Level::U32(counts)) => self.add_rows(&counts[start..], stride, weight),
+                None => {}
+            }
+        }
+        self.asked_len = 0;
     }
 
     #[inline]
-    fn add_rows<T: Copy>(&mut self, counts: &[T], stride: usize, weight: f32x8, float: impl Fn(T) -> f32) {
+    fn add_rows<T: Copy + Into<u32>>(&mut self, counts: &[T], stride: usize, weight: f32x8) {
         for (row, sums) in self.sums[..self.rows].iter_mut().enumerate() {
             for (column, sum) in sums[..self.columns].iter_mut().enumerate() {
                 let start = row * stride + 8 * column;
                 let eight: &[T; 8] = counts[start..start + 8].try_into().expect("eight counts");
-                let mut floats = [0.0; 8];
-                for (float_count, &count) in floats.iter_mut().zip(eight) {
-                    *float_count = float(count);
-                }
-                *sum = f32x8::from(floats).mul_add(weight, *sum);
+                *sum = to_float(widened(eight)).mul_add(weight, *sum);
             }
         }
     }
 
     /// Adds the lobes of all bins.
-    pub fn finish(&self, query: &Query, lobe: &Lobe, sums: &mut Sums) {
-        if !self.used {
-            return;
-        }
+    pub fn finish(&mut self, lobe: &Lobe, sums: &mut Sums) {
+        self.read();
+        let query = sums.query;
         let bins = &self.counts.bins;
         for (row, weights) in self.sums[..self.rows].iter().enumerate() {
             let y = bins.middle(1, f32x8::splat((self.first.1 + row) as f32));
@@ -337,9 +437,9 @@ impl<'a> CountSum<'a> {
                 };
                 let cos = dot([t.x, t.y, t.z]).fast_max(f32x8::splat(1e-3));
                 let (along, across) = (dot(along), dot(across));
-                let slope2 = (along * along / shares[0] + across * across / shares[1]) / (cos * cos);
+                let slope2 = along * along / shares[0] + across * across / shares[1];
                 let x = slope2 * lobe.sharpness();
-                let weights = weights & exists & x.cmp_le(f32x8::splat(lobe.limit()));
+                let weights = weights & exists & x.cmp_le(lobe.limit() * cos * cos);
                 if weights == f32x8::ZERO {
                     continue;
                 }

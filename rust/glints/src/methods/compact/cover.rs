@@ -6,27 +6,19 @@
 //! distributions deviate from the part's inside by d, the error is about
 //!
 //! ```text
-//! sqrt(p / s) s^2 / a * 0.4 d,
+//! sqrt(p / s) s^2 / a * 0.25 d,
 //! ```
 //!
 //! a random walk over the cut nodes, since each has too much as often as too little. A node is small if that is below
-//! [`TOLERANCE`]. Of n texels within reach of a half vector, a part has another share than the whole by about
-//! `1 / sqrt(n)`; as texels are not independent, and maps not the same everywhere, d is taken as [`CLUSTERING`] times as
-//! much, and not below [`LEAST_DEVIATION`].
+//! [`TOLERANCE`]. How much parts deviate is measured where there are counts ([`super::counts::Counts::deviations`]): by
+//! chance, and by the map's streaks and flakes.
 
 use glam::DVec2;
 
 use crate::footprint::{Coverage, Footprint, Parallelogram};
 
 /// Relative error that blurring the border may cost.
-const TOLERANCE: f64 = 0.013;
-
-/// How much more the parts of a node deviate than those of independent texels would.
-const CLUSTERING: f64 = 4.0;
-
-/// Bounds of the relative deviation of a node's part from the node.
-const LEAST_DEVIATION: f64 = 0.15;
-const LARGEST_DEVIATION: f64 = 0.5;
+const TOLERANCE: f64 = 0.015;
 
 /// A rectangle of texels, half open.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -162,20 +154,19 @@ impl Tree {
         self.map.0.div_ceil(self.side(level))
     }
 
-    /// Side in texels up to which a node is small against the footprint; `share`: of the map's texels, those within reach
-    /// of a half vector.
-    pub fn small_side(&self, footprint: &Footprint, share: f64) -> f64 {
+    /// Side in texels up to which a node is small against the footprint; `deviations`: of the parts of each level's nodes.
+    pub fn small_side(&self, footprint: &Footprint, deviations: &[f64]) -> f64 {
         let perimeter: f64 = footprint.edges().iter().map(|edge| 2.0 * edge.length()).sum();
-        let error = |side: f64| {
-            let deviation = CLUSTERING / (side * share.sqrt()).max(1e-9);
+        let is_small = |&(side, deviation): &(f64, f64)| {
             let walk = (perimeter / side).sqrt() * side * side / footprint.area();
-            0.4 * walk * deviation.clamp(LEAST_DEVIATION, LARGEST_DEVIATION)
+            0.25 * walk * deviation <= TOLERANCE
         };
         let sides = (0..self.levels).map(|level| f64::from(self.side(level)));
         sides
-            .take_while(|&side| error(side) <= TOLERANCE)
+            .zip(deviations.iter().copied())
+            .take_while(is_small)
             .last()
-            .unwrap_or(0.0)
+            .map_or(0.0, |(side, _)| side)
     }
 
     /// Number of nodes of a level.

@@ -1,6 +1,6 @@
 //! Saving and loading: a structure is built once, and used in place by every later run.
 //!
-//! **Format**, version 1. Numbers are little-endian. The fixed fields:
+//! **Format**, version 2. Numbers are little-endian. The fixed fields:
 //!
 //! | offset | type | |
 //! |---|---|---|
@@ -14,8 +14,8 @@
 //! | 40 | f32 | roughness of a flake, as [`Flake`] takes it |
 //! | 44 | u32 | its distribution: 0 Beckmann, 1 GGX |
 //! | 48 | u32 | normalization: 0 projected area, 1 as in the paper |
-//! | 52 | u32 | texels: 0 in [`super::rows`], 1 in [`super::blocks`] |
-//! | 56 | 2 u32 | of blocks, s and r; of rows, zero |
+//! | 52 | u32 | texels: 0 in [`super::tiles`], 1 in [`super::blocks`] |
+//! | 56 | 2 u32 | of blocks, s and r; of tiles, zero |
 //! | 64 | 3 f32, 2 u32 | grid of the quantised normals: corner, pitch, columns and rows |
 //! | 84 | 3 f32, 2 u32 | bins of the counts, likewise |
 //! | 104 | u32 | finest level with counts; the number of levels if none has |
@@ -26,7 +26,7 @@
 //!
 //! | kind | elements | |
 //! |---|---|---|
-//! | 0 | u32 | packed words, of rows or blocks |
+//! | 0 | u32 | packed words of blocks, or tiles |
 //! | 1 | 3 u32 | blocks: extents of the rows of cells |
 //! | 2 | u32 | blocks: where the rows of cells begin |
 //! | 3 | u16 or u32 | blocks: where the cells begin |
@@ -56,15 +56,14 @@ use super::check;
 use super::counts::{self, Counts, Level};
 use super::cover::Tree;
 use super::grid::Grid;
-use super::packing::Packed;
-use super::rows::Rows;
+use super::tiles::Tiles;
 use super::{CompactBinMap, LEAF_BITS, Texels};
 use crate::error::{Error, Result};
 use crate::flakes::{FlakeModel, Normalization};
 use crate::microfacet::{Distribution, Flake};
 
 /// The version that is written, and the only one that is read.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 const MAGIC: [u8; 8] = *b"\x89GLINTS\n";
 const BYTE_ORDER: u32 = 0x0a0b_0c0d;
@@ -218,7 +217,7 @@ impl CompactBinMap {
 
     fn sections(&self) -> Vec<Section<'_>> {
         let mut sections = match &self.texels {
-            Texels::Rows(rows) => vec![Section::new(WORDS, rows.words().units())],
+            Texels::Tiles(tiles) => vec![Section::new(WORDS, tiles.units())],
             Texels::Blocks(blocks) => vec![
                 Section::new(WORDS, blocks.words.units()),
                 Section::new(EXTENTS, &blocks.extents),
@@ -275,7 +274,7 @@ impl CompactBinMap {
     /// The fixed fields from the map's size on.
     fn fields(&self, sections: usize) -> Vec<u8> {
         let (texels, side_bits, cell_bits, grid) = match &self.texels {
-            Texels::Rows(rows) => (0, 0, 0, rows.grid()),
+            Texels::Tiles(tiles) => (0, 0, 0, tiles.grid()),
             Texels::Blocks(blocks) => {
                 let geometry = blocks.geometry();
                 (1, geometry.side_bits, geometry.cell_bits, &geometry.grid)
@@ -359,7 +358,7 @@ struct Preamble {
 
 /// How texels are stored.
 enum Layout {
-    Rows(Grid),
+    Tiles(Grid),
     Blocks(Geometry),
 }
 
@@ -422,7 +421,7 @@ impl Preamble {
         };
         let flake = Flake::new(distribution, alpha).map_err(|e| again(&format!("is inconsistent: {e}")))?;
         let layout = match texels {
-            0 => Layout::Rows(grid),
+            0 => Layout::Tiles(grid),
             1 => Layout::Blocks(Geometry {
                 map,
                 side_bits,
@@ -433,7 +432,7 @@ impl Preamble {
         };
         check::map_size(map).map_err(inconsistent)?;
         match &layout {
-            Layout::Rows(grid) => check::row_grid(grid),
+            Layout::Tiles(grid) => check::tile_grid(grid),
             Layout::Blocks(geometry) => check::geometry(geometry),
         }
         .map_err(inconsistent)?;
@@ -483,7 +482,7 @@ impl Preamble {
             left: &self.table,
         };
         let (texels, leaf_bits) = match &self.layout {
-            Layout::Rows(grid) => (Texels::Rows(self.rows(grid, &mut sections)?), LEAF_BITS),
+            Layout::Tiles(grid) => (Texels::Tiles(self.tiles(grid, &mut sections)?), LEAF_BITS),
             Layout::Blocks(geometry) => (
                 Texels::Blocks(blocks(geometry, &mut sections)?),
                 geometry.side_bits,
@@ -499,10 +498,10 @@ impl Preamble {
         ))
     }
 
-    fn rows(&self, grid: &Grid, sections: &mut Sections) -> Checked<Rows> {
-        let (bits, units) = Rows::layout(grid, self.map);
-        let words = sections.take(WORDS, units as u64)?;
-        Ok(Rows::from_words(self.map.0, *grid, Packed::new(words, bits)))
+    fn tiles(&self, grid: &Grid, sections: &mut Sections) -> Checked<Tiles> {
+        let (_, units) = Tiles::layout(grid, self.map);
+        let units = sections.take(WORDS, units as u64)?;
+        Ok(Tiles::from_units(self.map, *grid, units))
     }
 
     fn counts(&self, tree: &Tree, sections: &mut Sections) -> Checked<Counts> {

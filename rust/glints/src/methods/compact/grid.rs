@@ -4,6 +4,7 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use wide::f32x8;
 
+use super::lobes::lifted;
 use crate::normal_map::NormalMap;
 
 /// A position on the projected hemisphere as two whole numbers.
@@ -46,6 +47,12 @@ impl Grid {
     #[inline]
     pub fn middle(&self, axis: usize, index: f32x8) -> f32x8 {
         (index + 0.5).mul_add(f32x8::splat(self.pitch), f32x8::splat(self.low[axis]))
+    }
+
+    /// The normal over the middle of a cell.
+    pub fn normal(&self, cell: [u32; 2]) -> Vec3 {
+        let p = self.point(cell);
+        lifted(p.x, p.y)
     }
 
     /// The middle of a cell.

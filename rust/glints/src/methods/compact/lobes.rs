@@ -6,8 +6,10 @@
 //! tail.
 
 use glam::Vec3;
-use wide::{CmpGe, CmpGt, CmpLe, CmpLt, f32x8, u32x8};
+use wide::{CmpGe, CmpGt, CmpLe, CmpLt, f32x8};
 
+use super::grid::Grid;
+use super::lanes::{compress, eight, mask, places};
 use crate::flakes::{FlakeModel, Normalization};
 use crate::half_vector::DirectionPair;
 use crate::microfacet::Distribution;
@@ -111,7 +113,7 @@ fn chord2(tan2: f64) -> f64 {
 #[derive(Clone, Copy)]
 pub struct Query {
     pub half: Vec3,
-    /// For the flakes' shadowing; `None`: the distribution of normals and its density alone.
+    /// For the flakes' shadowing; `None`: nothing shadows.
     directions: Option<(Vec3, Vec3)>,
     projected: bool,
     distribution: Distribution,
@@ -121,19 +123,23 @@ pub struct Query {
     unshadowed: f32,
 }
 
-/// Value with shadowing, density, and distribution of normals; see [`crate::methods::Method`].
+/// Value, which is the distribution of normals or, with directions, the reflection; and density; see
+/// [`crate::methods::Method`].
 #[derive(Clone, Copy)]
 pub struct Terms {
     pub value: f32x8,
     pub density: f32x8,
-    pub ndf: f32x8,
 }
 
 impl Query {
-    pub fn reflection(model: &FlakeModel, pair: &DirectionPair) -> Self {
+    pub fn reflection(model: &FlakeModel, lobe: &Lobe, pair: &DirectionPair) -> Self {
+        let query = Self::distribution(model, pair.half);
+        // No flake within reach of the half vector may shadow; then the distribution of normals says it all.
+        let is_clear = |v: Vec3| v.dot(pair.half) - lobe.reach() >= query.unshadowed;
+        let clear = model.flake.kind() == Distribution::Beckmann && is_clear(pair.wi) && is_clear(pair.wo);
         Self {
-            directions: Some((pair.wi, pair.wo)),
-            ..Self::distribution(model, pair.half)
+            directions: (!clear).then_some((pair.wi, pair.wo)),
+            ..query
         }
     }
 
@@ -163,29 +169,33 @@ impl Query {
     #[inline]
     fn texels(&self, lobe: &Lobe, t: &Normals, chord2: f32x8) -> Terms {
         let cos = 1.0 - 0.5 * chord2;
-        let x = chord2 * (1.0 - 0.25 * chord2) / (cos * cos) * lobe.sharpness;
-        self.terms(x, f32x8::splat(lobe.peak), cos, t)
+        let sin2 = chord2 * (1.0 - 0.25 * chord2);
+        self.terms(sin2 * lobe.sharpness, f32x8::splat(lobe.peak), cos, t)
     }
 
-    /// The terms of eight normals whose lobes have the peak `peak` and are at `x = tan^2 / alpha^2`, `cos` being the cosine
-    /// to the half vector.
+    /// The terms of eight normals whose lobes have the peak `peak` and are at `tan^2 / alpha^2 = x / cos^2`, `cos` being the
+    /// cosine to the half vector.
     #[inline]
     pub fn terms(&self, x: f32x8, peak: f32x8, cos: f32x8, t: &Normals) -> Terms {
+        let z = if self.projected { t.z } else { f32x8::ONE };
+        let cos2 = cos * cos;
+        // One division for both.
+        let inv = 1.0 / (cos2 * z);
+        let (inv_cos2, inv_z) = (inv * z, inv * cos2);
+        let x = x * inv_cos2;
         let shape = match self.distribution {
             Distribution::Beckmann => exp_minus(x),
             Distribution::Ggx => 1.0 / ((1.0 + x) * (1.0 + x)),
         };
-        let cos2 = cos * cos;
-        let lobe = shape * peak / (cos2 * cos2);
-        let ndf = if self.projected { lobe / t.z } else { lobe };
+        let lobe = shape * peak * (inv_cos2 * inv_cos2);
+        let ndf = lobe * inv_z;
         let value = match self.directions {
             Some((wi, wo)) => ndf * self.smith_g1(wi, t) * self.smith_g1(wo, t),
-            None => f32x8::ZERO,
+            None => ndf,
         };
         Terms {
             value,
             density: lobe * cos,
-            ndf,
         }
     }
 
@@ -235,100 +245,98 @@ fn exp_minus(x: f32x8) -> f32x8 {
 pub struct Sums {
     pub query: Query,
     lobe: Lobe,
+    grid: Grid,
+    /// The half vector's projection and the lobe's reach, in cells of the grid.
+    center: [f32; 2],
+    radius2: f32,
     value: f32x8,
     density: f32x8,
-    ndf: f32x8,
-    queue: Queue,
-}
-
-/// Projected normals and weights of texels to come.
-struct Queue {
     x: [f32; QUEUE],
     y: [f32; QUEUE],
-    weight: [f32; QUEUE],
+    weights: [f32; QUEUE],
     len: usize,
 }
 
-/// Of eight normals, so many within reach are worth computing all eight.
-const CROWD: u32 = 4;
-
 /// Room for whole groups of eight.
-const QUEUE: usize = 64;
+const QUEUE: usize = 128;
 
 impl Sums {
-    pub fn new(query: Query, lobe: Lobe) -> Self {
+    /// `grid`: the one that normals are quantised to.
+    pub fn new(query: Query, lobe: Lobe, grid: Grid) -> Self {
+        let center = (query.half.truncate() - grid.low) / grid.pitch - 0.5;
         Self {
             query,
             lobe,
+            grid,
+            center: center.to_array(),
+            radius2: lobe.max_chord2 / (grid.pitch * grid.pitch),
             value: f32x8::ZERO,
             density: f32x8::ZERO,
-            ndf: f32x8::ZERO,
-            queue: Queue {
-                x: [0.0; QUEUE],
-                y: [0.0; QUEUE],
-                weight: [0.0; QUEUE],
-                len: 0,
-            },
+            x: [0.0; QUEUE],
+            y: [0.0; QUEUE],
+            weights: [0.0; QUEUE],
+            len: 0,
         }
     }
 
-    /// Bit k: the normal over `(x, y)` of lane k may be within reach; its projection is.
+    /// Bit k: the normal in cell `(x, y)` of lane k may be within reach; its projection is.
     #[inline(always)]
     pub fn near(&self, x: f32x8, y: f32x8) -> u32 {
-        let (dx, dy) = (x - self.query.half.x, y - self.query.half.y);
+        let (dx, dy) = (x - self.center[0], y - self.center[1]);
         let flat = dx.mul_add(dx, dy * dy);
-        flat.cmp_lt(f32x8::splat(self.lobe.max_chord2)).move_mask() as u32
+        flat.cmp_lt(f32x8::splat(self.radius2)).move_mask() as u32
     }
 
-    /// Adds the lobes of the normals over `(x, y)` in `lanes`, with their weights.
-    #[inline]
+    /// Adds the lobes of the normals in cells `(x, y)` of `lanes`, with their weights.
+    #[inline(always)]
     pub fn add(&mut self, lanes: u32, x: f32x8, y: f32x8, weights: f32x8) {
-        if lanes.count_ones() >= CROWD {
-            return self.add_lobes(lanes, x, y, weights);
-        }
-        let queue = &mut self.queue;
-        let (x, y, weights) = (x.to_array(), y.to_array(), weights.to_array());
-        let mut len = queue.len;
-        for k in bits(lanes) {
-            // Whole groups leave before the queue is full; the remainder is for the compiler.
-            let place = len % QUEUE;
-            queue.x[place] = x[k & 7];
-            queue.y[place] = y[k & 7];
-            queue.weight[place] = weights[k & 7];
-            len += 1;
-        }
-        queue.len = len;
-        if queue.len > QUEUE - 8 {
+        compress(lanes, x, &mut self.x, self.len);
+        compress(lanes, y, &mut self.y, self.len);
+        compress(lanes, weights, &mut self.weights, self.len);
+        self.taken(lanes);
+    }
+
+    /// The same, all of one weight.
+    #[inline(always)]
+    pub fn add_alike(&mut self, lanes: u32, x: f32x8, y: f32x8, weight: f32) {
+        compress(lanes, x, &mut self.x, self.len);
+        compress(lanes, y, &mut self.y, self.len);
+        *places(&mut self.weights, self.len) = [weight; 8];
+        self.taken(lanes);
+    }
+
+    #[inline(always)]
+    fn taken(&mut self, lanes: u32) {
+        self.len += lanes.count_ones() as usize;
+        if self.len > QUEUE - 8 {
             self.flush();
         }
     }
 
-    /// Adds the lobes of the normals over `(x, y)` in `lanes` at once.
-    #[inline]
-    fn add_lobes(&mut self, lanes: u32, x: f32x8, y: f32x8, weights: f32x8) {
+    /// Adds what waits in the queue.
+    #[inline(never)]
+    fn flush(&mut self) {
+        for start in (0..self.len).step_by(8) {
+            let lanes = (1 << (self.len - start).min(8)) - 1;
+            let x = self.grid.middle(0, eight(&self.x, start));
+            let y = self.grid.middle(1, eight(&self.y, start));
+            self.add_lobes(x, y, eight(&self.weights, start) & mask(lanes));
+        }
+        self.len = 0;
+    }
+
+    /// Adds the lobes of the normals over `(x, y)`.
+    #[inline(always)]
+    fn add_lobes(&mut self, x: f32x8, y: f32x8, weights: f32x8) {
         let t = Normals { x, y, z: lift(x, y) };
         let chord2 = self.query.chord2(&t);
         let inside = chord2.cmp_lt(f32x8::splat(self.lobe.max_chord2));
         // Terms out of reach have weight zero, and must be finite: at a right angle they would not be.
         let near = chord2.fast_min(f32x8::splat(self.lobe.max_chord2));
         let terms = self.query.texels(&self.lobe, &t, near);
-        let weights = weights & inside & mask(lanes);
+        let weights = weights & inside;
         self.value = terms.value.mul_add(weights, self.value);
         self.density = terms.density.mul_add(weights, self.density);
-        self.ndf = terms.ndf.mul_add(weights, self.ndf);
-    }
-
-    /// Adds what waits in the queue.
-    #[cold]
-    fn flush(&mut self) {
-        let len = self.queue.len;
-        for start in (0..len).step_by(8) {
-            let eight = |values: &[f32; QUEUE]| f32x8::from(&values[start..start + 8]);
-            let Queue { x, y, weight, .. } = &self.queue;
-            let (x, y, weight) = (eight(x), eight(y), eight(weight));
-            self.add_lobes((1 << (len - start).min(8)) - 1, x, y, weight);
-        }
-        self.queue.len = 0;
     }
 
     /// Adds terms times weights.
@@ -339,7 +347,11 @@ impl Sums {
         let weighted = |term: f32x8, sum: f32x8| (term & used).mul_add(weights, sum);
         self.value = weighted(terms.value, self.value);
         self.density = weighted(terms.density, self.density);
-        self.ndf = weighted(terms.ndf, self.ndf);
+    }
+
+    /// The half vector's projection, and what is within reach of it, in cells of the grid.
+    pub fn window(&self) -> ([f32; 2], f32) {
+        (self.center, self.radius2.sqrt())
     }
 
     /// Chord within which texels count.
@@ -348,35 +360,11 @@ impl Sums {
         self.lobe.reach()
     }
 
-    /// `(value, density, ndf)`.
-    pub fn totals(&mut self) -> (f32, f32, f32) {
+    /// Value and density.
+    pub fn totals(&mut self) -> (f32, f32) {
         self.flush();
-        (
-            self.value.reduce_add(),
-            self.density.reduce_add(),
-            self.ndf.reduce_add(),
-        )
+        (self.value.reduce_add(), self.density.reduce_add())
     }
-}
-
-/// The numbers of the lanes.
-pub const LANES: f32x8 = f32x8::new([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
-
-/// The lanes of a bit mask, as a mask of floats.
-#[inline]
-fn mask(lanes: u32) -> f32x8 {
-    let bits = u32x8::new([1, 2, 4, 8, 16, 32, 64, 128]);
-    bytemuck::cast((u32x8::splat(lanes) & bits).cmp_eq(bits))
-}
-
-/// The positions of the set bits.
-#[inline]
-pub fn bits(mut mask: u32) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        let k = mask.trailing_zeros() as usize;
-        mask &= mask.wrapping_sub(1);
-        (k < 32).then_some(k)
-    })
 }
 
 /// `z` of the unit vectors over `(x, y)`; quantisation may leave the disk.

@@ -18,7 +18,7 @@
 //!
 //! * a texel's normal, at a twentieth of a standard deviation, takes as many bits as both maps together need for its bin
 //!   alone: what is exact costs no more memory, if it is stored once;
-//! * eight quantised texels are compared with the half vector in two or three nanoseconds: testing a thousand is cheaper
+//! * a byte of each coordinate tells for 64 texels at a time which are near the half vector: testing a thousand is cheaper
 //!   than walking a tree. Only what need not be looked at must be left out.
 //!
 //! What can be left out depends on the roughness. Of a footprint's texels, a share of about `3 alpha^2` (times the map's
@@ -26,12 +26,12 @@
 //!
 //! | roughness | share | texels are kept | module |
 //! |---|---|---|---|
-//! | below [`ROUGH`] | under 1 % | sorted by direction, in blocks: only the cells around h are read | [`blocks`] |
-//! | above | more | in the map's order: all texels of the footprint are read | [`rows`] |
+//! | low | under [`ROUGH`] | sorted by direction, in blocks: only the cells around h are read | [`blocks`] |
+//! | high | more | in the map's order: all texels of the footprint are tested | [`tiles`] |
 //!
 //! Footprints that hold many texels that matter are large against them, and their distribution is a mean over many: above
 //! a size, [`counts`] answer for whole squares of texels, and squares at the border that are small against the footprint
-//! are weighted by their area ([`cover`]).
+//! are weighted by their area ([`cover`]). Texels that the border cuts get their exact area ([`border`]).
 //!
 //! **Memory** 2.5 to 4 bytes a texel for the normals, a byte and a half at most for the rest: counts are kept of as many
 //! levels, from the whole map down, as fit into [`BYTES_PER_TEXEL`].
@@ -50,14 +50,16 @@
 
 mod array;
 mod blocks;
+mod border;
 mod check;
 mod counts;
 mod cover;
 mod file;
 mod grid;
+mod lanes;
 mod lobes;
 mod packing;
-mod rows;
+mod tiles;
 
 use glam::{Vec2, Vec3};
 use wide::f32x8;
@@ -68,12 +70,13 @@ use crate::footprint::{Footprint, Parallelogram, Part};
 use crate::half_vector::DirectionPair;
 use crate::hash::mix;
 use crate::normal_map::NormalMap;
-use blocks::{Blocks, Geometry};
+use blocks::{Blocks, Geometry, Reader};
+use border::Border;
 use counts::{CountSum, Counts};
 use cover::{Node, Rect, Scale, Treatment, Tree};
 use grid::Grid;
 use lobes::{Lobe, Query, Sums};
-use rows::Rows;
+use tiles::Tiles;
 
 pub use file::{Header, VERSION, is_saved, read_header};
 
@@ -81,7 +84,7 @@ pub use file::{Header, VERSION, is_saved, read_header};
 pub const ROUGH: f64 = 0.02;
 
 /// Most texels of a block within reach of a typical half vector.
-const NEAR_TEXELS: f64 = 120.0;
+const NEAR_TEXELS: f64 = 200.0;
 
 /// What the whole structure may take, 18 MB for 2048 x 2048 texels.
 pub const BYTES_PER_TEXEL: f64 = 18e6 / (2048.0 * 2048.0);
@@ -108,35 +111,39 @@ pub struct CompactBinMap {
     counts: Counts,
     /// Finest level of the tree with counts, or its root.
     finest: usize,
-    /// Share of the texels within reach of a typical half vector; zero if there are no counts to tell.
-    share: f64,
+    /// Relative deviation of the parts of each level's nodes.
+    deviations: Vec<f64>,
 }
 
 /// The quantised normals.
 enum Texels {
-    Rows(Rows),
+    Tiles(Tiles),
     Blocks(Blocks),
 }
 
 impl Texels {
-    fn normal(&self, (column, row): (u32, u32)) -> Vec3 {
+    fn cell(&self, (column, row): (u32, u32)) -> [u32; 2] {
         match self {
-            Self::Rows(rows) => rows.normal(column, row),
-            Self::Blocks(blocks) => blocks.normal(column, row),
+            Self::Tiles(tiles) => tiles.cell(column, row),
+            Self::Blocks(blocks) => blocks.cell(column, row),
         }
+    }
+
+    fn normal(&self, texel: (u32, u32)) -> Vec3 {
+        self.grid().normal(self.cell(texel))
     }
 
     fn bytes(&self) -> usize {
         match self {
-            Self::Rows(rows) => rows.words().units().bytes(),
+            Self::Tiles(tiles) => tiles.units().bytes(),
             Self::Blocks(blocks) => blocks.bytes(),
         }
     }
 
-    fn pitch(&self) -> f32 {
+    fn grid(&self) -> &Grid {
         match self {
-            Self::Rows(rows) => rows.grid().pitch,
-            Self::Blocks(blocks) => blocks.geometry().grid.pitch,
+            Self::Tiles(tiles) => tiles.grid(),
+            Self::Blocks(blocks) => &blocks.geometry().grid,
         }
     }
 }
@@ -153,8 +160,8 @@ impl CompactBinMap {
             &Lobe::new(model.flake.kind(), f64::from(alpha).powi(2)),
         );
         let (texels, leaf_bits) = if share >= ROUGH {
-            let grid = row_grid(bounds, QUANTUM * deviation(alpha));
-            (Texels::Rows(Rows::new(map, grid)), LEAF_BITS)
+            let grid = tiles::grid(bounds, QUANTUM * deviation(alpha));
+            (Texels::Tiles(Tiles::new(map, grid)), LEAF_BITS)
         } else {
             let geometry = block_geometry(size, alpha, share, bounds);
             (Texels::Blocks(Blocks::new(map, geometry)), geometry.side_bits)
@@ -162,14 +169,12 @@ impl CompactBinMap {
         let tree = Tree::new(size, leaf_bits);
         let bins = counts::bins(alpha, grid::bounds(map, counts::project));
         let least_level = match texels {
-            Texels::Rows(_) => 0,
+            Texels::Tiles(_) => 0,
             Texels::Blocks(_) => 1,
         };
         let finest = finest_counted_level(&tree, &bins, least_level, texels.bytes(), share);
-        let quantised = |column, row| match &texels {
-            Texels::Rows(rows) => rows.normal(column, row),
-            Texels::Blocks(blocks) => blocks.quantised(map.normal(column, row)),
-        };
+        let grid = texels.grid();
+        let quantised = |column, row| grid.normal(grid.cell(map.normal(column, row)));
         let counts = Counts::new(&tree, bins, alpha, finest, quantised);
         Self::assemble(size, model, tree, texels, counts)
     }
@@ -178,12 +183,12 @@ impl CompactBinMap {
         let alpha2 = f64::from(model.flake.alpha()).powi(2);
         // What quantisation adds to the normals' variance, a twelfth of the pitch squared along each axis, the lobe
         // gives up.
-        let taken = f64::from(texels.pitch()).powi(2) / 6.0;
+        let taken = f64::from(texels.grid().pitch).powi(2) / 6.0;
         let lobe = Lobe::new(model.flake.kind(), (alpha2 - taken).max(0.5 * alpha2));
         let finest = (0..tree.levels()).find(|&level| counts.has(level));
         Self {
             finest: finest.unwrap_or(tree.levels() - 1),
-            share: counts.share(&tree, &lobe),
+            deviations: counts.deviations(&tree),
             map,
             model,
             lobe,
@@ -219,14 +224,14 @@ impl CompactBinMap {
                 .iter()
                 .map(|edge| edge.length())
                 .fold(0.0, f64::max);
-        matches!(self.texels, Texels::Rows(_)) && (region.texel_count() < DIRECT || thickness < least)
+        matches!(self.texels, Texels::Tiles(_)) && (region.texel_count() < DIRECT || thickness < least)
     }
 
     fn scale(&self, footprint: &Footprint) -> Scale {
         Scale {
-            small: self.tree.small_side(footprint, self.share),
+            small: self.tree.small_side(footprint, &self.deviations),
             leaf: match self.texels {
-                Texels::Rows(_) => self.finest,
+                Texels::Tiles(_) => self.finest,
                 Texels::Blocks(_) => 0,
             },
         }
@@ -237,12 +242,12 @@ impl CompactBinMap {
         scale.small >= f64::from(self.tree.side(self.tree.levels() - 1))
     }
 
-    /// Value, density and distribution of normals over a footprint.
-    fn query(&self, footprint: &Footprint, query: Query) -> (f32, f32, f32) {
-        let mut sums = Sums::new(query, self.lobe);
+    /// Value and density over a footprint.
+    fn query(&self, footprint: &Footprint, query: Query) -> (f32, f32) {
+        let mut sums = Sums::new(query, self.lobe, *self.texels.grid());
         let Some(region) = footprint.region() else {
-            let normal = self.texels.normal(footprint.texel());
-            sums.add(1, f32x8::splat(normal.x), f32x8::splat(normal.y), f32x8::ONE);
+            let [x, y] = self.texels.cell(footprint.texel());
+            sums.add_alike(1, f32x8::splat(x as f32), f32x8::splat(y as f32), 1.0);
             return sums.totals();
         };
         if self.is_direct(region) {
@@ -251,8 +256,8 @@ impl CompactBinMap {
             self.add_cover(footprint, &mut sums);
         }
         let inv_area = (1.0 / footprint.area()) as f32;
-        let (value, density, ndf) = sums.totals();
-        (value * inv_area, density * inv_area, ndf * inv_area)
+        let (value, density) = sums.totals();
+        (value * inv_area, density * inv_area)
     }
 
     /// Adds a small footprint's texels.
@@ -261,34 +266,44 @@ impl CompactBinMap {
             low: (0, 0),
             high: self.map,
         };
-        let Texels::Rows(rows) = &self.texels else { return };
+        let Texels::Tiles(tiles) = &self.texels else {
+            return;
+        };
         footprint.for_each_part(|part| match part {
-            Part::Cut(region) => rows.add(&region, &everything, sums),
+            Part::Cut(region) => {
+                let mut border = Border::new(&region);
+                tiles.add(&mut border, &everything, sums);
+                border.flush(sums);
+            }
             // Only a map of fewer texels than a small footprint lies inside one entirely.
-            Part::Whole(count) => rows.add_all(&everything, count as f32, sums),
+            Part::Whole(count) => tiles.add_all(&everything, count as f32, sums),
             Part::Texel { .. } => {}
         });
     }
 
     /// Adds what covers a large footprint.
     fn add_cover(&self, footprint: &Footprint, sums: &mut Sums) {
-        let mut total = CountSum::new(&self.counts, sums.query.half, sums.reach());
+        let mut covered = Covered::new(self, sums);
         let scale = self.scale(footprint);
-        let is_unit = self.is_unit();
-        let mut add = |node: &Node, treatment: Treatment, region: Option<&Parallelogram>, sums: &mut Sums| {
-            self.add_node(node, treatment, region, &mut total, sums);
-        };
         if self.is_everywhere(scale) {
             let even = footprint.area() / (f64::from(self.map.0) * f64::from(self.map.1));
-            let part = cover::Part::new(None, scale);
-            self.tree.cover(&part, &is_unit, &mut |node, treatment| {
-                add(node, treatment.scaled(even), None, sums);
-            });
+            self.tree.cover(
+                &cover::Part::new(None, scale),
+                &self.is_unit(),
+                &mut |node, treatment| {
+                    covered.add(node, treatment.scaled(even), None);
+                },
+            );
         } else if let Some(region) = footprint.single_part() {
-            let part = cover::Part::new(Some(region), scale);
-            self.tree.cover(&part, &is_unit, &mut |node, treatment| {
-                add(node, treatment, Some(region), sums);
-            });
+            let mut border = Border::new(region);
+            self.tree.cover(
+                &cover::Part::new(Some(region), scale),
+                &self.is_unit(),
+                &mut |node, treatment| {
+                    covered.add(node, treatment, Some(&mut border));
+                },
+            );
+            covered.end_part(Some(&mut border));
         } else {
             // The same node may be covered in several periods: it is looked at once.
             let mut nodes = Vec::new();
@@ -299,52 +314,91 @@ impl CompactBinMap {
                     Part::Texel { .. } => return,
                 };
                 let part = cover::Part::new(region, scale);
+                let mut border = region.map(Border::new);
                 self.tree.cover(
                     &part,
-                    &is_unit,
+                    &self.is_unit(),
                     &mut |node, treatment| match treatment.scaled(count) {
                         Treatment::Whole(weight) => nodes.push((*node, weight)),
-                        other => add(node, other, region, sums),
+                        other => covered.add(node, other, border.as_mut()),
                     },
                 );
+                covered.end_part(border.as_mut());
             });
             nodes.sort_unstable_by_key(|&(node, _)| node);
             for same in nodes.chunk_by(|a, b| a.0 == b.0) {
                 let weight = same.iter().map(|&(_, weight)| weight).sum();
-                add(&same[0].0, Treatment::Whole(weight), None, sums);
+                covered.add(&same[0].0, Treatment::Whole(weight), None);
             }
         }
-        let query = sums.query;
-        total.finish(&query, &self.lobe, sums);
+        covered.finish();
+    }
+}
+
+/// What covers a footprint: counts and blocks wait until there are several to read.
+struct Covered<'a> {
+    map: &'a CompactBinMap,
+    /// Small footprints have none.
+    counts: Option<CountSum<'a>>,
+    blocks: Option<Reader<'a>>,
+    sums: &'a mut Sums,
+}
+
+impl<'a> Covered<'a> {
+    fn new(map: &'a CompactBinMap, sums: &'a mut Sums) -> Self {
+        Self {
+            map,
+            counts: None,
+            blocks: match &map.texels {
+                Texels::Blocks(blocks) => Some(Reader::new(blocks, sums)),
+                Texels::Tiles(_) => None,
+            },
+            sums,
+        }
     }
 
-    fn add_node(
-        &self,
-        node: &Node,
-        treatment: Treatment,
-        region: Option<&Parallelogram>,
-        total: &mut CountSum,
-        sums: &mut Sums,
-    ) {
-        let rect = self.tree.rect(node);
-        match (treatment, &self.texels, region) {
-            (Treatment::Whole(weight), _, _) if self.counts.has(node.level) => {
-                total.add(&self.tree, node, weight as f32);
+    fn add(&mut self, node: &Node, treatment: Treatment, border: Option<&mut Border>) {
+        let weight = match treatment {
+            Treatment::Whole(weight) => Some(weight as f32),
+            Treatment::Texels => None,
+            Treatment::Nothing | Treatment::Descend => return,
+        };
+        let rect = self.map.tree.rect(node);
+        match (&self.map.texels, &mut self.blocks, weight, border) {
+            (_, _, Some(weight), _) if self.map.counts.has(node.level) => {
+                let new = || CountSum::new(&self.map.counts, self.sums.query.half, self.sums.reach());
+                self.counts
+                    .get_or_insert_with(new)
+                    .add(&self.map.tree, node, weight);
             }
-            (Treatment::Whole(weight), Texels::Blocks(blocks), _) => {
-                blocks.add_all(&rect, weight as f32, sums);
-            }
-            (Treatment::Whole(weight), Texels::Rows(rows), _) => rows.add_all(&rect, weight as f32, sums),
-            (Treatment::Texels, Texels::Blocks(blocks), Some(region)) => blocks.add(region, &rect, sums),
-            (Treatment::Texels, Texels::Rows(rows), Some(region)) => rows.add(region, &rect, sums),
+            (_, Some(blocks), weight, border) => blocks.add(&rect, weight, border, self.sums),
+            (Texels::Tiles(tiles), _, Some(weight), _) => tiles.add_all(&rect, weight, self.sums),
+            (Texels::Tiles(tiles), _, None, Some(border)) => tiles.add(border, &rect, self.sums),
             _ => {}
+        }
+    }
+
+    /// Adds what waits for the border.
+    fn end_part(&mut self, mut border: Option<&mut Border>) {
+        if let Some(blocks) = &mut self.blocks {
+            blocks.flush(border.as_deref_mut(), self.sums);
+        }
+        if let Some(border) = border {
+            border.flush(self.sums);
+        }
+    }
+
+    fn finish(mut self) {
+        self.end_part(None);
+        if let Some(mut counts) = self.counts {
+            counts.finish(&self.map.lobe, self.sums);
         }
     }
 }
 
 impl Method for CompactBinMap {
     fn evaluate(&self, footprint: &Footprint, pair: &DirectionPair) -> Reflection {
-        let (value, density, _) = self.query(footprint, Query::reflection(&self.model, pair));
+        let (value, density) = self.query(footprint, Query::reflection(&self.model, &self.lobe, pair));
         Reflection { value, density }
     }
 
@@ -353,7 +407,7 @@ impl Method for CompactBinMap {
     }
 
     fn ndf(&self, footprint: &Footprint, h: Vec3) -> f32 {
-        self.query(footprint, Query::distribution(&self.model, h)).2
+        self.query(footprint, Query::distribution(&self.model, h)).0
     }
 
     fn sample(&self, footprint: &Footprint, u: [f32; 4]) -> Option<Vec3> {
@@ -441,20 +495,12 @@ fn deviation(alpha: f32) -> f64 {
     f64::from(alpha) / std::f64::consts::SQRT_2
 }
 
-/// The grid of [`rows`] of a pitch, or of the least coarser one whose cells words can tell apart.
-fn row_grid(bounds: (Vec2, Vec2), mut pitch: f64) -> Grid {
-    loop {
-        let grid = Grid::covering(bounds, pitch);
-        if rows::fits(&grid) {
-            return grid;
-        }
-        pitch *= 1.02;
-    }
-}
-
 /// Sizes of blocks, cells and words: the narrowest words whose cells are not too many; with the widest, coarser normals.
 fn block_geometry(map: (u32, u32), alpha: f32, share: f64, bounds: (Vec2, Vec2)) -> Geometry {
-    let side_bits = if share * 65536.0 < NEAR_TEXELS { 8 } else { 7 };
+    let side_bits = (6..=8)
+        .rev()
+        .find(|bits| share * f64::from(1_u32 << (2 * bits)) < NEAR_TEXELS)
+        .unwrap_or(6);
     let pitch = QUANTUM * deviation(alpha);
     let extent = (bounds.1 - bounds.0).as_dvec2().max(glam::DVec2::splat(pitch));
     // A box as large as the hemisphere's holds the disk only.

@@ -141,6 +141,21 @@ fn bytes([a, b]: [u32; 2]) -> u32x8 {
     u32x8::new([a, b, a, b, a, b, a, b]) >> u32x8::new([0, 0, 8, 8, 16, 16, 24, 24]) & u32x8::splat(0xff)
 }
 
+/// Eight narrower numbers. Spelled out: as a loop, it goes through memory.
+#[inline(always)]
+pub fn widened<T: Copy + Into<u32>>(&[a, b, c, d, e, f, g, h]: &[T; 8]) -> u32x8 {
+    u32x8::new([
+        a.into(),
+        b.into(),
+        c.into(),
+        d.into(),
+        e.into(),
+        f.into(),
+        g.into(),
+        h.into(),
+    ])
+}
+
 /// Whole numbers below 2^31 as floating-point ones.
 #[inline(always)]
 pub fn to_float(words: u32x8) -> f32x8 {

@@ -33,7 +33,7 @@ fn largest_distance(map: &NormalMap, compact: &CompactBinMap) -> f32 {
             .abs()
             .max_element()
     };
-    texels.map(distance).fold(0.0, f32::max) / compact.texels.pitch()
+    texels.map(distance).fold(0.0, f32::max) / compact.texels.grid().pitch
 }
 
 proptest! {
@@ -64,7 +64,9 @@ fn blocks_of_a_single_cell_are_found_again() {
         let geometry = block_geometry((512, 300), 0.004, 1e-4, grid::bounds(&map, Vec3::truncate));
         let blocks = Blocks::new(&map, geometry);
         for (column, row) in [(0, 0), (255, 255), (256, 0), (511, 299), (17, 299)] {
-            let distance = (blocks.normal(column, row) - map.normal(column, row)).truncate();
+            let distance = (blocks.geometry().grid.normal(blocks.cell(column, row))
+                - map.normal(column, row))
+            .truncate();
             assert!(
                 distance.abs().max_element() < geometry.grid.pitch,
                 "{column} {row}"

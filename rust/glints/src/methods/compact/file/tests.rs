@@ -121,7 +121,7 @@ fn flat_maps_with_few_steep_texels_come_back_at_the_least_roughness() {
     for (column, row) in [(0, 0), (77 % 64, 1), (99 % 64, 1)] {
         let distance = (structure.normal(column, row) - map.normal(column, row)).truncate();
         assert!(
-            distance.abs().max_element() < 0.51 * structure.texels.pitch(),
+            distance.abs().max_element() < 0.51 * structure.texels.grid().pitch,
             "{distance}"
         );
     }
