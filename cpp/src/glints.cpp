@@ -86,8 +86,8 @@ Drawn from_bridge(bridge::Drawn drawn) {
 }
 
 Statistics from_bridge(const bridge::Statistics &s) {
-    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds,       s.bins, s.refinement,
-            s.refinement_step,     s.masking_alpha_u, s.masking_alpha_v, std::string(s.warning)};
+    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds,   s.bins,
+            s.refinement,          s.refinement_step, s.masking_alpha_u, s.masking_alpha_v, std::string(s.warning)};
 }
 
 // A Rust string holds nothing else.
@@ -157,9 +157,8 @@ Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, 
     return translated([&] {
         bridge::InverseBinMapOptions given{to_bridge(options.structure), options.bins, options.leaf_size,
                                            to_bridge(options.binning)};
-        return Brdf(
-            std::make_unique<Impl>(Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), given,
-                                                                to_bridge(interpolation))}));
+        return Brdf(std::make_unique<Impl>(
+            Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), given, to_bridge(interpolation))}));
     });
 }
 

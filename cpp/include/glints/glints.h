@@ -109,7 +109,7 @@ enum class Interpolation : uint8_t {
 /// resampled, the method built from the finer one: memory grows with the square of `refinement`.
 struct GLINTS_API InterpolationOptions {
     Interpolation interpolation = Interpolation::Nearest;
-    uint32_t refinement = 0; ///< texels per texel and side, 1 to 8; 0: as many as the map's bends and the roughness ask for
+    uint32_t refinement = 0; ///< texels per texel and side, 1 to 8; 0: as many as bends and roughness ask for
 };
 
 /// Parameters of Yan et al. 2016; the intrinsic roughness is `SurfaceOptions::alpha / sqrt(2)`.
@@ -172,8 +172,7 @@ struct Statistics {
     double build_seconds;                   ///< wall time of the construction, without reading the file
     uint32_t bins;                          ///< bins per side; 0 for methods without bins
     uint32_t refinement;                    ///< elements or refined texels per texel and side; 0 without
-    float refinement_step;                  ///< root mean square step of normals between neighbouring refined texels, in
-                                            ///< standard deviations of a flake's lobe; 0 without
+    float refinement_step;                  ///< their mean step in standard deviations of a lobe; 0 without
     float masking_alpha_u, masking_alpha_v; ///< roughness of G_x along u and v; 0 without masking
     std::string warning;                    ///< what users should know about their input; empty: nothing
 };

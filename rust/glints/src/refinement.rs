@@ -16,7 +16,7 @@
 //!
 //! | root mean square step x | footprints of 4 texels' width | of 1 texel |
 //! |---|---|---|
-//! | 3 to 3.5 | 12 to 14 % | 22 to 29 % |
+//! | 3 to 3.5 | 12 to 14 % | 22 to 30 % |
 //! | 2.3 to 2.6 | 6 to 11 % | 15 to 25 % |
 //! | 1.5 to 1.75 | 1.5 to 3 % | 3 to 8 % |
 //! | 1 to 1.3 | 1 to 4 % | 2 to 7 % |
