@@ -26,9 +26,14 @@
 //! worse: bilinear patches meet at the centres of texels, and only with an even one do borders of refined texels lie
 //! there. That is 20 % and 27 % for 1 at x = 1.9, 4.5 % and 7.5 % at x = 0.9.
 //!
+//! Yan's curved elements, 4 x 4 for each texel, differ from the compact inverse bin map of a refined wave map by 0.6 % where both
+//! have the same Gaussian footprint; without refinement it is 7 % (see the tests). With their own footprints, half a pixel's
+//! standard deviation against a box, they differ by much more than that.
+//!
 //! **How many** [`automatic`] takes the least power of two with `x <=` [`LARGEST_STEP`], and 1 only below a third of that.
 //!
-//! **Memory** `k^2` times that of the method, for all texels alike, and 12 k^2 bytes a texel while it is built. To
+//! **Memory** `k^2` times that of the method, for all texels alike, and 12 k^2 bytes a texel while it is built: 16, 63 and
+//! 254 MB for k = 1, 2 and 4 of a map of 2048 x 2048 texels at alpha = 0.05, with a peak of 0.12, 0.31 and 1.09 GB. To
 //! refine only where the map bends would save most of it on maps that are flat nearly everywhere, such as scratches, but
 //! texels would have different areas: every query relies on equal ones, to weigh them by integers and to find them by
 //! row and column. The other way to save it, a single texel with a lobe widened by the variance of the normals inside
