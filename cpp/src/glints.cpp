@@ -70,6 +70,10 @@ bridge::Surface to_bridge(const SurfaceOptions &o) {
             to_bridge(o.masking),      o.masking_alpha_u, o.masking_alpha_v};
 }
 
+bridge::InterpolationOptions to_bridge(const InterpolationOptions &o) {
+    return {o.interpolation == Interpolation::Bilinear, o.refinement};
+}
+
 Drawn from_bridge(bridge::Drawn drawn) {
     switch (drawn) {
     case bridge::Drawn::Flake:
@@ -82,8 +86,8 @@ Drawn from_bridge(bridge::Drawn drawn) {
 }
 
 Statistics from_bridge(const bridge::Statistics &s) {
-    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds, s.bins,
-            s.refinement,          s.masking_alpha_u, s.masking_alpha_v};
+    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds,   s.bins,
+            s.refinement,          s.refinement_step, s.masking_alpha_u, s.masking_alpha_v, std::string(s.warning)};
 }
 
 // A Rust string holds nothing else.
@@ -148,18 +152,21 @@ Brdf::Brdf(Brdf &&) noexcept = default;
 Brdf &Brdf::operator=(Brdf &&) noexcept = default;
 Brdf::~Brdf() = default;
 
-Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, const InverseBinMapOptions &options) {
+Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, const InverseBinMapOptions &options,
+                           const InterpolationOptions &interpolation) {
     return translated([&] {
         bridge::InverseBinMapOptions given{to_bridge(options.structure), options.bins, options.leaf_size,
                                            to_bridge(options.binning)};
-        return Brdf(
-            std::make_unique<Impl>(Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), given)}));
+        return Brdf(std::make_unique<Impl>(
+            Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), given, to_bridge(interpolation))}));
     });
 }
 
-Brdf Brdf::direct(const NormalMap &map, const SurfaceOptions &surface) {
-    return translated(
-        [&] { return Brdf(std::make_unique<Impl>(Impl{bridge::direct(*map.m_impl->map, to_bridge(surface))})); });
+Brdf Brdf::direct(const NormalMap &map, const SurfaceOptions &surface, const InterpolationOptions &interpolation) {
+    return translated([&] {
+        return Brdf(std::make_unique<Impl>(
+            Impl{bridge::direct(*map.m_impl->map, to_bridge(surface), to_bridge(interpolation))}));
+    });
 }
 
 Brdf Brdf::unfiltered(const NormalMap &map, const SurfaceOptions &surface, Interpolation interpolation) {

@@ -105,6 +105,13 @@ enum class Interpolation : uint8_t {
     Bilinear, ///< projected normals are interpolated bilinearly
 };
 
+/// How the inverse bin map and the direct sum see the surface between the centres of texels. An interpolated map is
+/// resampled, the method built from the finer one: memory grows with the square of `refinement`.
+struct GLINTS_API InterpolationOptions {
+    Interpolation interpolation = Interpolation::Nearest;
+    uint32_t refinement = 0; ///< texels per texel and side, 1 to 8; 0: as many as bends and roughness ask for
+};
+
 /// Parameters of Yan et al. 2016; the intrinsic roughness is `SurfaceOptions::alpha / sqrt(2)`.
 struct GLINTS_API Yan16Options {
     /// Curved elements follow the bilinearly interpolated map; flat ones have the texels' normals.
@@ -164,8 +171,10 @@ struct Statistics {
     uint64_t structure_bytes;               ///< memory that `evaluate`, `pdf` and `sample` need
     double build_seconds;                   ///< wall time of the construction, without reading the file
     uint32_t bins;                          ///< bins per side; 0 for methods without bins
-    uint32_t refinement;                    ///< elements per texel and side; 0 for methods without elements
+    uint32_t refinement;                    ///< elements or refined texels per texel and side; 0 without
+    float refinement_step;                  ///< their mean step in standard deviations of a lobe; 0 without
     float masking_alpha_u, masking_alpha_v; ///< roughness of G_x along u and v; 0 without masking
+    std::string warning;                    ///< what users should know about their input; empty: nothing
 };
 
 /// A normal map filtered over footprints by one of the methods.
@@ -174,9 +183,11 @@ public:
     /// Inverse bin map, Atanasov et al. 2021 (Sections 5.2-5.4); with `surface.alpha = 0` that of their talk of 2020,
     /// which needs `options.bins`.
     static Brdf inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
-                                const InverseBinMapOptions &options = {});
+                                const InverseBinMapOptions &options = {},
+                                const InterpolationOptions &interpolation = {});
     /// The exact sum over every texel of the footprint (Eq. 11).
-    static Brdf direct(const NormalMap &map, const SurfaceOptions &surface);
+    static Brdf direct(const NormalMap &map, const SurfaceOptions &surface,
+                       const InterpolationOptions &interpolation = {});
     /// The normal under the footprint's centre (Eq. 5), whatever the footprint.
     static Brdf unfiltered(const NormalMap &map, const SurfaceOptions &surface,
                            Interpolation interpolation = Interpolation::Nearest);

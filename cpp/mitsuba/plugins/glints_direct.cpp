@@ -5,7 +5,7 @@ Glints by direct summation (`glints_direct`)
 The exact reflection of a normal map's flakes over each pixel's footprint: the sum over every texel that the footprint
 covers (Eq. 11 of Atanasov et al. 2021), without bins and without any data structure. The ground truth of `glints_ibm`.
 
-All parameters are the common ones, documented in `glints_ibm.cpp`; there are no others.
+The parameters are the common ones, documented in `glints_ibm.cpp`, and `interpolation` and `refinement` of `glints_ibm`.
 
 Guidance
 --------
@@ -29,9 +29,9 @@ Python:
 */
 #include "registry.h"
 
-static glints::Brdf make_brdf(const mitsuba::Properties &, const glints::NormalMap &map,
+static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::NormalMap &map,
                               const glints::SurfaceOptions &surface) {
-    return glints::Brdf::direct(map, surface);
+    return glints::Brdf::direct(map, surface, glints_mitsuba::interpolation_parameters(props));
 }
 
 extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {

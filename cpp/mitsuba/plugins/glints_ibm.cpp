@@ -59,6 +59,14 @@ Parameters of this plugin
 |             |         | (Default with roughness: `projected`)                                                        |
 | `leaf_size` | integer | Most texels in a leaf of the forest over the map. Larger: less memory, slower evaluation. 0: |
 |             |         | the paper's 10, with `alpha` = 0 its 16. (Default: 0)                                        |
+| `interpol-  | string  | What the surface is between the centres of texels. `nearest`: piecewise flat, one flake a    |
+| ation`      |         | texel. `bilinear`: the projected normals are interpolated, the surface of `glints_yan16`     |
+|             |         | with curved elements. (Default: `nearest`)                                                   |
+| `refinement`| integer | With `bilinear`: the interpolated map is resampled to so many texels per texel and side, 1   |
+|             |         | to 8, at the square of memory and build time. 0: as many as its bends ask for, a power of two|
+|             |         | at which normals of neighbours are at most 1.5 standard deviations of a flake's lobe apart   |
+|             |         | (`alpha` / sqrt(2), root mean square), as far as 8 and 8192 x 8192 texels in all go; a warn- |
+|             |         | ing tells where that is too few. Required with `alpha` = 0. (Default: 0)                     |
 
 Guidance
 --------
@@ -68,6 +76,10 @@ Guidance
 - `distribution` = `ggx`: a lobe is cut off at seven times its roughness, 2 % of it lie outside and are moved inside. In the
   paper's structure the bins around a normal hold 83 % of its lobe; the rest of the tail is moved into them, so that
   energy is kept, but little of the glow is seen. A quarter of the `bins` holds 99 %; `glints_direct` shows all of it.
+- `interpolation` = `bilinear` is for maps that mean a smooth surface, such as bumps, waves and scratches. Flakes are flat:
+  interpolated, their borders become slopes that are not there. It takes 4 bytes times the square of the refinement for
+  each texel, and 12 more while it is built. Distributions of normals come within 3 % of the interpolated surface's where a
+  footprint covers some texels, if the refinement is not cut short. Masking stays that of the map as it is given.
 - `alpha` = 0: the talk shows car paint with 127 bins a side, scratched metal with 63 (4K maps) and 255 (8K). A bin is
   as large as a disk of radius 1.4 / `bins` radians: every flake reflects into a lobe of that width, and the reflections
   of small lights show the bins' outlines where a footprint covers few flakes.
@@ -115,7 +127,7 @@ static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::No
         size_t choice = glints_mitsuba::choice_parameter(props, "binning", {"projected", "equal_solid_angle"});
         options.binning = choice == 0 ? glints::Binning::Projected : glints::Binning::EqualSolidAngle;
     }
-    return glints::Brdf::inverse_bin_map(map, surface, options);
+    return glints::Brdf::inverse_bin_map(map, surface, options, glints_mitsuba::interpolation_parameters(props));
 }
 
 extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {

@@ -110,6 +110,7 @@ public:
             << "  masking_alpha = [" << s.masking_alpha_u << ", " << s.masking_alpha_v << "],\n"
             << "  bins = " << s.bins << ",\n"
             << "  refinement = " << s.refinement << ",\n"
+            << "  refinement_step = " << s.refinement_step << ",\n"
             << "  structure_bytes = " << s.structure_bytes << ",\n"
             << "  build_seconds = " << s.build_seconds << "\n"
             << "]";
@@ -139,6 +140,8 @@ private:
         glints::Statistics s = m_brdf.statistics();
         Log(Info, "%s: \"%s\", %u x %u texels, %s, built in %s.", m_parameters.plugin, m_parameters.filename, m_width,
             m_height, util::mem_string(s.structure_bytes), util::time_string((float) (1e3 * s.build_seconds), true));
+        if (!s.warning.empty())
+            Log(Warn, "%s: \"%s\": %s.", m_parameters.plugin, m_parameters.filename, s.warning);
     }
 
     static bool above_horizon(const Vector3f &w) { return Frame3f::cos_theta(w) > 0.f; }

@@ -100,6 +100,13 @@ size_t choice_parameter(const Properties &props, const char *name, std::initiali
     Throw("%s: parameter \"%s\" is \"%s\"; it must be one of %s.", props.plugin_name(), name, given, allowed);
 }
 
+glints::InterpolationOptions interpolation_parameters(const Properties &props) {
+    glints::InterpolationOptions options;
+    options.interpolation = glints::Interpolation(choice_parameter(props, "interpolation", {"nearest", "bilinear"}));
+    options.refinement = unsigned_parameter(props, "refinement", 0);
+    return options;
+}
+
 float roughness_parameter(const Properties &props, const char *other, float factor, float fallback) {
     if (!props.has_property(other))
         return fallback;

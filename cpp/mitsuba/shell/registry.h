@@ -44,6 +44,9 @@ GLINTS_MITSUBA_API uint32_t unsigned_parameter(const mitsuba::Properties &props,
 GLINTS_MITSUBA_API size_t choice_parameter(const mitsuba::Properties &props, const char *name,
                                            std::initializer_list<const char *> choices);
 
+/// The parameters `interpolation` and `refinement` of the plugins whose map is resampled to be interpolated.
+GLINTS_MITSUBA_API glints::InterpolationOptions interpolation_parameters(const mitsuba::Properties &props);
+
 /// Roughness alpha from another parameter that stands for it, alpha = factor * value; `fallback` where it is not given.
 /// Both together are refused.
 GLINTS_MITSUBA_API float roughness_parameter(const mitsuba::Properties &props, const char *other, float factor,

@@ -8,6 +8,7 @@
 //! * Evaluation is total and free of panics; it takes plain values and a shared reference, from any thread.
 //! * This crate has no unsafe code of its own.
 
+use std::borrow::Cow;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Instant;
 
@@ -25,7 +26,8 @@ use glints::methods::unfiltered::{Interpolation, Unfiltered};
 use glints::methods::yan16::{self, Elements, Yan16};
 use glints::microfacet::{Distribution, Flake};
 use glints::mip_map::MipMap;
-use glints::normal_map::{self, Encoding};
+use glints::normal_map::{Encoding, NormalMap};
+use glints::refinement::Refinement;
 
 #[cxx::bridge(namespace = "glints::bridge")]
 mod ffi {
@@ -113,6 +115,13 @@ mod ffi {
         binning: BinningKind,
     }
 
+    /// Refinement of zero: as many texels as the map needs.
+    #[derive(Clone, Copy)]
+    struct InterpolationOptions {
+        bilinear: bool,
+        refinement: u32,
+    }
+
     #[derive(Clone, Copy)]
     struct Yan16Options {
         curved: bool,
@@ -150,8 +159,10 @@ mod ffi {
         build_seconds: f64,
         bins: u32,
         refinement: u32,
+        refinement_step: f32,
         masking_alpha_u: f32,
         masking_alpha_v: f32,
+        warning: String,
     }
 
     // ---- what C++ may call ------------------------------------------------------------------------------------------------
@@ -165,8 +176,13 @@ mod ffi {
         fn normal(self: &Map, column: i64, row: i64) -> Vector;
 
         type Brdf;
-        fn inverse_bin_map(map: &Map, surface: Surface, options: InverseBinMapOptions) -> Result<Box<Brdf>>;
-        fn direct(map: &Map, surface: Surface) -> Result<Box<Brdf>>;
+        fn inverse_bin_map(
+            map: &Map,
+            surface: Surface,
+            options: InverseBinMapOptions,
+            interpolation: InterpolationOptions,
+        ) -> Result<Box<Brdf>>;
+        fn direct(map: &Map, surface: Surface, interpolation: InterpolationOptions) -> Result<Box<Brdf>>;
         fn unfiltered(map: &Map, surface: Surface, bilinear: bool) -> Result<Box<Brdf>>;
         fn yan16(map: &Map, surface: Surface, options: Yan16Options) -> Result<Box<Brdf>>;
         fn evaluate(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> Evaluation;
@@ -196,7 +212,7 @@ mod ffi {
 // ---- normal maps --------------------------------------------------------------------------------------------------------------
 
 /// A shared, immutable normal map.
-pub struct Map(normal_map::NormalMap);
+pub struct Map(NormalMap);
 
 fn load_map(filename: &str, encoding: ffi::MapEncoding, flip_y: bool) -> Result<Box<Map>> {
     let encoding = match encoding {
@@ -205,14 +221,14 @@ fn load_map(filename: &str, encoding: ffi::MapEncoding, flip_y: bool) -> Result<
         _ => Encoding::Automatic,
     };
     guarded("filename", filename, || {
-        normal_map::NormalMap::load(filename, encoding, flip_y).map(|map| Box::new(Map(map)))
+        NormalMap::load(filename, encoding, flip_y).map(|map| Box::new(Map(map)))
     })
 }
 
 fn map_from_normals(name: &str, width: u32, height: u32, xyz: &[f32]) -> Result<Box<Map>> {
     let normals: Vec<Vec3> = xyz.chunks_exact(3).map(Vec3::from_slice).collect();
     guarded("filename", name, || {
-        normal_map::NormalMap::from_normals(name, width, height, &normals).map(|map| Box::new(Map(map)))
+        NormalMap::from_normals(name, width, height, &normals).map(|map| Box::new(Map(map)))
     })
 }
 
@@ -241,20 +257,28 @@ pub struct Brdf {
     core: Core,
     alpha: f32,
     build_seconds: f64,
+    refinement: Option<Refinement>,
 }
+
+/// One normal a texel, for methods that interpolate themselves or not at all.
+const AS_IT_IS: ffi::InterpolationOptions = ffi::InterpolationOptions {
+    bilinear: false,
+    refinement: 0,
+};
 
 fn inverse_bin_map(
     map: &Map,
     surface: ffi::Surface,
     options: ffi::InverseBinMapOptions,
+    interpolation: ffi::InterpolationOptions,
 ) -> Result<Box<Brdf>> {
-    build(map, surface, || {
+    build(map, surface, interpolation, |map| {
         if is_compact(surface, options)? {
-            return Ok(Box::new(CompactBinMap::new(&map.0, flakes(surface)?)));
+            return Ok(Box::new(CompactBinMap::new(&map, flakes(surface)?)));
         }
         if surface.alpha == 0.0 {
             let options = specular_options(surface, options)?;
-            return Ok(Box::new(SpecularBinMap::new(&map.0, options)?));
+            return Ok(Box::new(SpecularBinMap::new(&map, options)?));
         }
         if options.binning == ffi::BinningKind::EqualSolidAngle {
             return Err(Error::Parameter {
@@ -266,7 +290,7 @@ fn inverse_bin_map(
             });
         }
         let options = inverse_bin_map_options(options.bins, options.leaf_size);
-        Ok(Box::new(InverseBinMap::new(&map.0, flakes(surface)?, options)?))
+        Ok(Box::new(InverseBinMap::new(&map, flakes(surface)?, options)?))
     })
 }
 
@@ -328,9 +352,9 @@ fn inverse_bin_map_options(bins: u32, leaf_size: u32) -> inverse_bin_map::Option
     }
 }
 
-fn direct(map: &Map, surface: ffi::Surface) -> Result<Box<Brdf>> {
-    build(map, surface, || {
-        Ok(Box::new(Direct::new(map.0.clone(), flakes(surface)?)))
+fn direct(map: &Map, surface: ffi::Surface, interpolation: ffi::InterpolationOptions) -> Result<Box<Brdf>> {
+    build(map, surface, interpolation, |map| {
+        Ok(Box::new(Direct::new(map.into_owned(), flakes(surface)?)))
     })
 }
 
@@ -340,9 +364,9 @@ fn unfiltered(map: &Map, surface: ffi::Surface, bilinear: bool) -> Result<Box<Br
     } else {
         Interpolation::Nearest
     };
-    build(map, surface, || {
+    build(map, surface, AS_IT_IS, |map| {
         Ok(Box::new(Unfiltered::new(
-            map.0.clone(),
+            map.into_owned(),
             flakes(surface)?,
             interpolation,
         )))
@@ -350,7 +374,7 @@ fn unfiltered(map: &Map, surface: ffi::Surface, bilinear: bool) -> Result<Box<Br
 }
 
 fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result<Box<Brdf>> {
-    build(map, surface, || {
+    build(map, surface, AS_IT_IS, |map| {
         if !surface.projected {
             return Err(Error::Parameter {
                 name: "normalization",
@@ -370,7 +394,7 @@ fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result
         let elements = match (options.curved, options.refinement) {
             (false, _) => Elements::Flat,
             (true, 0) => Elements::Curved {
-                refinement: yan16::resolving_refinement(&map.0),
+                refinement: yan16::resolving_refinement(&map),
             },
             (true, refinement) => Elements::Curved { refinement },
         };
@@ -379,7 +403,7 @@ fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result
             intrinsic: surface.alpha / std::f32::consts::SQRT_2,
             footprint_sigma: options.footprint_sigma,
         };
-        Ok(Box::new(Yan16::new(&map.0, options)?))
+        Ok(Box::new(Yan16::new(&map, options)?))
     })
 }
 
@@ -405,10 +429,37 @@ fn normalization(surface: ffi::Surface) -> Normalization {
     }
 }
 
+/// The map that a method is built from, and how it was refined, if it is interpolated.
+fn interpolated(
+    map: &NormalMap,
+    surface: ffi::Surface,
+    interpolation: ffi::InterpolationOptions,
+) -> Result<(Cow<'_, NormalMap>, Option<Refinement>)> {
+    if !interpolation.bilinear {
+        if interpolation.refinement != 0 {
+            return Err(Error::Parameter {
+                name: "refinement",
+                value: interpolation.refinement.to_string(),
+                reason: "is for interpolated maps; add interpolation = bilinear, or leave the parameter out"
+                    .into(),
+            });
+        }
+        return Ok((Cow::Borrowed(map), None));
+    }
+    let flake = match surface.alpha {
+        0.0 => None,
+        _ => Some(flakes(surface)?.flake),
+    };
+    let refinement = Refinement::new(map, flake, interpolation.refinement)?;
+    Ok((Cow::Owned(map.refined(refinement.refinement)?), Some(refinement)))
+}
+
+/// `method` builds from the map as it is interpolated; masking is that of the map as it was given.
 fn build(
     map: &Map,
     surface: ffi::Surface,
-    method: impl FnOnce() -> Result<Box<dyn Method>>,
+    interpolation: ffi::InterpolationOptions,
+    method: impl FnOnce(Cow<NormalMap>) -> Result<Box<dyn Method>>,
 ) -> Result<Box<Brdf>> {
     let masking = match surface.masking {
         ffi::MaskingKind::Beckmann => Masking::Beckmann,
@@ -420,9 +471,12 @@ fn build(
     };
     guarded("filename", map.0.name(), || {
         let mut build_seconds = 0.0;
+        let mut refinement = None;
         let core = Core::new(&map.0, masking, || {
             let start = Instant::now();
-            let method = method();
+            let (map, refined) = interpolated(&map.0, surface, interpolation)?;
+            refinement = refined;
+            let method = method(map);
             build_seconds = start.elapsed().as_secs_f64();
             method
         })?;
@@ -431,6 +485,7 @@ fn build(
             core,
             alpha,
             build_seconds,
+            refinement,
         }))
     })
 }
@@ -482,9 +537,14 @@ impl Brdf {
             structure_bytes: method.structure_bytes() as u64,
             build_seconds: self.build_seconds,
             bins: method.bins().unwrap_or(0),
-            refinement: method.refinement().unwrap_or(0),
+            refinement: self
+                .refinement
+                .map_or(method.refinement(), |r| Some(r.refinement))
+                .unwrap_or(0),
+            refinement_step: self.refinement.map_or(0.0, |r| r.step as f32),
             masking_alpha_u,
             masking_alpha_v,
+            warning: self.refinement.and_then(|r| r.warning()).unwrap_or_default(),
         }
     }
 
@@ -587,8 +647,10 @@ impl FlakeLayer {
             build_seconds: self.build_seconds,
             bins: method.bins().unwrap_or(0),
             refinement: method.refinement().unwrap_or(0),
+            refinement_step: 0.0,
             masking_alpha_u,
             masking_alpha_v,
+            warning: String::new(),
         }
     }
 

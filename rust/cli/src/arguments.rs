@@ -1,13 +1,16 @@
 //! Parameters that several commands share.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use glints::flakes::{FlakeModel, Normalization};
 use glints::microfacet::{self, Flake};
 use glints::normal_map::{self, NormalMap};
+use glints::refinement::{MAX_REFINEMENT, Refinement};
+use serde_json::{Value, json};
 
-use crate::failure::Result;
+use crate::failure::{self, Failure, Result};
 use crate::progress::Progress;
 
 /// Which file, and how it stores normals.
@@ -81,6 +84,83 @@ impl FlakeArguments {
     pub fn model(&self) -> Result<FlakeModel> {
         model(self.distribution, self.alpha)
     }
+}
+
+/// What the surface is between the centres of texels.
+#[derive(Args)]
+pub struct InterpolationArguments {
+    /// The surface between the centres of texels: `nearest`, flat texels, or `bilinear`, the interpolated map,
+    /// which is resampled to more texels
+    #[arg(long, value_enum, default_value_t)]
+    pub interpolation: Interpolation,
+
+    /// Texels per texel and side of an interpolated map, 1 to 8, at the square of memory; 0: as many as its
+    /// bends and the roughness ask for
+    #[arg(long, value_name = "TEXELS", default_value_t = 0)]
+    refinement: u32,
+}
+
+/// See [`glints::refinement`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Interpolation {
+    #[default]
+    Nearest,
+    Bilinear,
+}
+
+impl InterpolationArguments {
+    /// Refuses what can be told before a map is read.
+    pub fn check(&self) -> Result<()> {
+        let problem = if self.refinement > MAX_REFINEMENT {
+            "must be 1 to 8, or 0 for as many as the map needs"
+        } else if self.refinement > 0 && self.interpolation == Interpolation::Nearest {
+            "is for interpolated maps; add --interpolation bilinear, or leave it out"
+        } else {
+            return Ok(());
+        };
+        Err(Failure::usage(format!(
+            "parameter \"refinement\" = {}: {problem}",
+            self.refinement
+        )))
+    }
+
+    /// How an interpolated map is resampled; `None` for flat texels. Warns if that leaves facets.
+    pub fn refinement(&self, map: &NormalMap, model: FlakeModel) -> Result<Option<Refinement>> {
+        if self.interpolation == Interpolation::Nearest {
+            return Ok(None);
+        }
+        let refinement = Refinement::new(map, Some(model.flake), self.refinement)?;
+        if let Some(warning) = refinement.warning() {
+            failure::warn(&warning);
+        }
+        Ok(Some(refinement))
+    }
+}
+
+/// The resampled map, or the map itself.
+pub fn refined<'a>(map: &'a NormalMap, refinement: Option<Refinement>) -> Result<Cow<'a, NormalMap>> {
+    let Some(Refinement { refinement, .. }) = refinement else {
+        return Ok(Cow::Borrowed(map));
+    };
+    let _progress = Progress::spinner("interpolating the map");
+    Ok(Cow::Owned(map.refined(refinement)?))
+}
+
+/// For reports; null for flat texels.
+pub fn refinement_json(refinement: Option<Refinement>) -> Value {
+    refinement.map_or(
+        Value::Null,
+        |r| json!({ "texels_per_side": r.refinement, "step": r.step }),
+    )
+}
+
+/// The same in words.
+pub fn refinement_text(refinement: &Value) -> String {
+    format!(
+        "interpolated, {0} x {0} texels for each, {1:.2} standard deviations of a lobe apart",
+        refinement["texels_per_side"],
+        refinement["step"].as_f64().unwrap_or(f64::NAN)
+    )
 }
 
 /// Flakes that share the projected area, so that the distribution of normals integrates to one.

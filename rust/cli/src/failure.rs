@@ -37,19 +37,27 @@ impl Failure {
         Self::failed(format!("\"{}\": {reason}", path.display()))
     }
 
-    /// Writes the line. Names of files may hold anything; what would break the line or steer the terminal is
-    /// replaced.
+    /// Writes the line.
     pub fn report(&self) -> ExitCode {
-        use std::io::Write;
-        let line: String = self
-            .message
-            .chars()
-            .map(|c| if c.is_control() { ' ' } else { c })
-            .collect();
-        // Nobody is left to be told when this fails.
-        let _ = writeln!(std::io::stderr(), "glints: {line}");
+        write_line(&self.message);
         ExitCode::from(self.status)
     }
+}
+
+/// Tells what does not keep a command from its result, in one line.
+pub fn warn(message: &str) {
+    write_line(&format!("warning: {message}"));
+}
+
+/// Names of files may hold anything; what would break the line or steer the terminal is replaced.
+fn write_line(message: &str) {
+    use std::io::Write;
+    let line: String = message
+        .chars()
+        .map(|c| if c.is_control() { ' ' } else { c })
+        .collect();
+    // Nobody is left to be told when this fails.
+    let _ = writeln!(std::io::stderr(), "glints: {line}");
 }
 
 impl From<glints::error::Error> for Failure {

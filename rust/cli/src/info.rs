@@ -12,7 +12,10 @@ use glints::microfacet;
 use glints::normal_map::{Encoding, NormalMap};
 use serde_json::{Value, json};
 
-use crate::arguments::{Distribution, MapArguments, decimal, model};
+use crate::arguments::{
+    Distribution, InterpolationArguments, MapArguments, decimal, model, refined, refinement_json,
+    refinement_text,
+};
 use crate::failure::Result;
 use crate::output;
 use crate::progress::Progress;
@@ -29,7 +32,8 @@ use crate::structures;
 /// * Tiling: root mean square difference of the normals of neighbouring texels, inside and across the borders,
 ///   where the map meets its repetition. A map tiles when its borders differ no more than the worst column and
 ///   row inside it.
-/// * Structures: bins per side, memory and build time of the compact inverse bin map for flakes of each roughness.
+/// * Structures: bins per side, memory and build time of the compact inverse bin map for flakes of each roughness; of an
+///   interpolated map with its refinement, and how far apart normals of neighbouring refined texels are.
 ///
 /// Of a saved structure, its header is told: the map's size, the flakes it was made for, and memory.
 ///
@@ -47,6 +51,9 @@ pub struct Arguments {
     /// Distribution of a flake's microfacets
     #[arg(long, value_enum, default_value_t)]
     distribution: Distribution,
+
+    #[command(flatten)]
+    interpolation: InterpolationArguments,
 
     /// Print one line of JSON
     #[arg(long)]
@@ -74,9 +81,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         .iter()
         .map(|&alpha| model(arguments.distribution, alpha))
         .collect::<Result<Vec<_>>>()?;
+    arguments.interpolation.check()?;
     let map = arguments.map.load()?;
     let mut report = describe(&map, &arguments.map.map);
-    report["structures"] = structures(&map, &models)?.into();
+    report["structures"] = structures(&map, &models, &arguments.interpolation)?.into();
     output::print(&if arguments.json {
         format!("{report}\n")
     } else {
@@ -185,19 +193,25 @@ impl Seams {
     }
 }
 
-fn structures(map: &NormalMap, models: &[FlakeModel]) -> Result<Vec<Value>> {
+fn structures(
+    map: &NormalMap,
+    models: &[FlakeModel],
+    interpolation: &InterpolationArguments,
+) -> Result<Vec<Value>> {
     let progress = Progress::bar("building structures", models.len() as u64);
     models
         .iter()
         .map(|&model| {
             let start = Instant::now();
-            let method = structures::ibm(map, model);
+            let refinement = interpolation.refinement(map, model)?;
+            let method = structures::ibm(&*refined(map, refinement)?, model);
             progress.advance(1);
             Ok(json!({
                 "alpha": decimal(model.flake.alpha()),
                 "bins": method.bins(),
                 "bytes": method.structure_bytes(),
                 "build_seconds": start.elapsed().as_secs_f64(),
+                "refinement": refinement_json(refinement),
             }))
         })
         .collect()
@@ -248,8 +262,13 @@ fn text(report: &Value) -> String {
         seam("v"),
     );
     for structure in report["structures"].as_array().into_iter().flatten() {
+        let refinement = &structure["refinement"];
+        let interpolated = match refinement {
+            Value::Null => String::new(),
+            refinement => format!("; {}", refinement_text(refinement)),
+        };
         text += &format!(
-            "{:<18}alpha {}: {} bins per side, {:.1} MB, built in {:.2} s\n",
+            "{:<18}alpha {}: {} bins per side, {:.1} MB, built in {:.2} s{interpolated}\n",
             "structure",
             structure["alpha"],
             structure["bins"],

@@ -11,9 +11,13 @@ use glints::methods::direct::Direct;
 use glints::methods::unfiltered::{Interpolation, Unfiltered};
 use glints::methods::yan16::{self, Elements, Yan16};
 use glints::normal_map::NormalMap;
+use glints::refinement::Refinement;
 use serde_json::{Value, json};
 
-use crate::arguments::{Distribution, FlakeArguments, MapArguments, decimal};
+use crate::arguments::{
+    self, Distribution, FlakeArguments, InterpolationArguments, MapArguments, decimal, refined,
+    refinement_json, refinement_text,
+};
 use crate::failure::{Failure, Result};
 use crate::output::{self, Destination};
 use crate::picture::{self, DECADES, Format};
@@ -53,6 +57,9 @@ pub struct Arguments {
 
     #[command(flatten)]
     flake: FlakeArguments,
+
+    #[command(flatten)]
+    interpolation: InterpolationArguments,
 
     /// Pixels per side of the picture, in 16 to 4096
     #[arg(long, value_name = "PIXELS", default_value_t = 512, value_parser = clap::value_parser!(u32).range(16..=4096))]
@@ -98,7 +105,25 @@ enum MethodName {
 }
 
 impl MethodName {
-    fn build(self, map: &NormalMap, model: FlakeModel) -> Result<Box<dyn Method>> {
+    /// `refinement`: that of an interpolated map.
+    fn build(
+        self,
+        map: &NormalMap,
+        model: FlakeModel,
+        refinement: Option<Refinement>,
+    ) -> Result<Box<dyn Method>> {
+        if self.is_resampled() {
+            return self.build_from(&*refined(map, refinement)?, model, refinement.is_some());
+        }
+        self.build_from(map, model, refinement.is_some())
+    }
+
+    /// Whether an interpolated map is resampled for the method; others interpolate it themselves.
+    fn is_resampled(self) -> bool {
+        matches!(self, Self::Direct | Self::Ibm | Self::IbmPaper)
+    }
+
+    fn build_from(self, map: &NormalMap, model: FlakeModel, bilinear: bool) -> Result<Box<dyn Method>> {
         let _progress = Progress::spinner("building the structure");
         let mixture = |elements| -> Result<Box<dyn Method>> {
             let options = yan16::Options {
@@ -116,12 +141,23 @@ impl MethodName {
             Self::Yan16Curved => mixture(Elements::Curved {
                 refinement: yan16::resolving_refinement(map),
             })?,
-            Self::Unfiltered => Box::new(Unfiltered::new(map.clone(), model, Interpolation::Nearest)),
+            Self::Unfiltered => {
+                let interpolation = match bilinear {
+                    true => Interpolation::Bilinear,
+                    false => Interpolation::Nearest,
+                };
+                Box::new(Unfiltered::new(map.clone(), model, interpolation))
+            }
         })
     }
 
-    /// Methods whose elements are Gaussians have no other flakes.
-    fn check(self, distribution: Distribution) -> Result<()> {
+    /// Methods whose elements are Gaussians have no other flakes, and flat ones are not interpolated.
+    fn check(self, distribution: Distribution, interpolation: arguments::Interpolation) -> Result<()> {
+        if self == Self::Yan16 && interpolation == arguments::Interpolation::Bilinear {
+            return Err(Failure::usage(
+                "parameter \"interpolation\" = bilinear: the elements of yan16 are flat; take yan16_curved",
+            ));
+        }
         if matches!(self, Self::Yan16 | Self::Yan16Curved) && distribution != Distribution::Beckmann {
             return Err(Failure::usage(format!(
                 "parameter \"distribution\" = {}: {} is a mixture of Gaussians; leave the parameter out or take \
@@ -174,29 +210,34 @@ fn parse_footprint(text: &str) -> std::result::Result<[DVec2; 2], String> {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let format = Format::of(&arguments.output)?;
     for method in std::iter::once(arguments.method).chain(arguments.compare) {
-        method.check(arguments.flake.distribution)?;
+        method.check(
+            arguments.flake.distribution,
+            arguments.interpolation.interpolation,
+        )?;
     }
+    arguments.interpolation.check()?;
     let destination = Destination::new(&arguments.output, arguments.force, &[&arguments.map.map])?;
     let model = arguments.flake.model()?;
     let map = arguments.map.load()?;
-    let method = arguments.method.build(&map, model)?;
+    let refinement = arguments.interpolation.refinement(&map, model)?;
+    let method = arguments.method.build(&map, model, refinement)?;
     let compare = match arguments.compare {
-        Some(name) => Some(name.build(&map, model)?),
+        Some(name) => Some(name.build(&map, model, refinement)?),
         None => None,
     };
-    let footprint = footprint(arguments, &map);
-    drop(map);
+    let over = |method: &dyn Method| footprint(arguments, &map, method.map_size());
+    let asked = footprint(arguments, &map, (map.width(), map.height()));
     let problem = Problem {
-        method: method.as_ref(),
-        compare: compare.as_deref(),
-        footprint,
+        method: (method.as_ref(), over(method.as_ref())),
+        compare: compare.as_deref().map(|method| (method, over(method))),
         lobe: f64::from(model.flake.alpha()) / std::f64::consts::SQRT_2,
         size: arguments.size,
         points: arguments.points,
     };
+    drop(map);
     let estimate = problem.solve();
     let peak = write(&destination, format, arguments.size, &estimate)?;
-    let report = report(arguments, &footprint, &estimate, peak);
+    let report = report(arguments, &asked, refinement, &estimate, peak);
     output::print(&if arguments.json {
         format!("{report}\n")
     } else {
@@ -204,12 +245,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     })
 }
 
-fn footprint(arguments: &Arguments, map: &NormalMap) -> Footprint {
-    let size = DVec2::new(f64::from(map.width()), f64::from(map.height()));
+/// The footprint over the map as resampled to `width` x `height` texels; its edges are given in the map's own.
+fn footprint(arguments: &Arguments, map: &NormalMap, (width, height): (u32, u32)) -> Footprint {
+    let size = DVec2::new(f64::from(width), f64::from(height));
+    let refinement = size / DVec2::new(f64::from(map.width()), f64::from(map.height()));
     // Whole periods go in double precision: they change nothing.
     let center = DVec2::from(arguments.at.map(|x| x.rem_euclid(1.0))) * size;
-    let [a, b] = arguments.footprint;
-    Footprint::in_texels(map.width(), map.height(), center, a, b)
+    let [a, b] = arguments.footprint.map(|edge| edge * refinement);
+    Footprint::in_texels(width, height, center, a, b)
 }
 
 /// The common peak of the scale.
@@ -227,7 +270,13 @@ fn write(destination: &Destination, format: Format, size: u32, estimate: &Estima
     Ok(peak)
 }
 
-fn report(arguments: &Arguments, footprint: &Footprint, estimate: &Estimate, peak: f32) -> Value {
+fn report(
+    arguments: &Arguments,
+    footprint: &Footprint,
+    refinement: Option<Refinement>,
+    estimate: &Estimate,
+    peak: f32,
+) -> Value {
     let pictures: Vec<Value> = [Some(arguments.method), arguments.compare]
         .into_iter()
         .flatten()
@@ -248,6 +297,7 @@ fn report(arguments: &Arguments, footprint: &Footprint, estimate: &Estimate, pea
         "footprint_texels": footprint.edges().map(|edge| edge.to_array()),
         "alpha": decimal(arguments.flake.alpha),
         "distribution": name_of(arguments.flake.distribution),
+        "refinement": refinement_json(refinement),
         "size": arguments.size,
         "scale": [peak / 10_f32.powf(DECADES), peak],
         "strategy": estimate.strategy,
@@ -267,6 +317,9 @@ fn text(report: &Value) -> String {
         report["points"],
         report["strategy"].as_str().unwrap_or_default()
     );
+    if !report["refinement"].is_null() {
+        text += &format!("map               {}\n", refinement_text(&report["refinement"]));
+    }
     for picture in report["pictures"].as_array().into_iter().flatten() {
         text += &format!(
             "{:<17} peak {}, mean {}, integral against the cosine {}, relative L1 error of the pixels below {}\n",

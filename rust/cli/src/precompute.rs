@@ -1,10 +1,11 @@
 //! `glints precompute`: structures that are built once and loaded by renderers.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
-use crate::arguments::{FlakeArguments, MapArguments};
+use crate::arguments::{FlakeArguments, InterpolationArguments, MapArguments, refined};
 use crate::failure::Result;
 use crate::output::{self, Destination};
 use crate::progress::Progress;
@@ -18,7 +19,7 @@ pub enum Command {
 
 /// The inverse bin map of a normal map for flakes of one roughness
 ///
-/// The file stands for the map, --alpha and --distribution: it is mapped into memory and used in place, without
+/// The file stands for the map, --interpolation, --alpha and --distribution: it is mapped into memory and used in place, without
 /// building anything. It is read by the version of this program that wrote it, and by all with the same file format.
 /// `glints info FILE` tells what it holds. The file appears when it is complete; nothing is left of an interrupted
 /// build.
@@ -33,6 +34,9 @@ pub struct IbmArguments {
     #[command(flatten)]
     flake: FlakeArguments,
 
+    #[command(flatten)]
+    interpolation: InterpolationArguments,
+
     /// File to write
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -46,7 +50,13 @@ pub fn run(command: &Command) -> Result<()> {
     let Command::Ibm(arguments) = command;
     let destination = Destination::new(&arguments.output, arguments.force, &[&arguments.map.map])?;
     let model = arguments.flake.model()?;
+    arguments.interpolation.check()?;
     let map = arguments.map.load()?;
+    let refinement = arguments.interpolation.refinement(&map, model)?;
+    let map = match refined(&map, refinement)? {
+        Cow::Owned(refined) => refined,
+        Cow::Borrowed(_) => map,
+    };
     let structure = {
         let _progress = Progress::spinner("building the structure");
         structures::ibm(&map, model)

@@ -32,9 +32,10 @@ const BATCH: u32 = 1 << 16;
 
 /// What is integrated.
 pub struct Problem<'a> {
-    pub method: &'a dyn Method,
-    pub compare: Option<&'a dyn Method>,
-    pub footprint: Footprint,
+    /// A method, and the footprint over its map.
+    pub method: (&'a dyn Method, Footprint),
+    /// Another one, over the same part of the surface.
+    pub compare: Option<(&'a dyn Method, Footprint)>,
     /// Standard deviation of a lobe without tilt, on the disk.
     pub lobe: f64,
     /// Pixels per side of the square around the disk.
@@ -74,8 +75,9 @@ impl Problem<'_> {
         }
     }
 
-    fn methods(&self) -> impl Iterator<Item = &dyn Method> {
-        std::iter::once(self.method).chain(self.compare)
+    fn methods(&self) -> impl Iterator<Item = (&dyn Method, &Footprint)> {
+        let both = std::iter::once(&self.method).chain(&self.compare);
+        both.map(|(method, footprint)| (*method, footprint))
     }
 
     fn pixel_side(&self) -> f64 {
@@ -84,8 +86,11 @@ impl Problem<'_> {
 
     /// Values of D at `h`; the second is zero without comparison.
     fn values(&self, h: Vec3) -> [f64; 2] {
-        let ndf = |method: &dyn Method| f64::from(method.ndf(&self.footprint, h));
-        [ndf(self.method), self.compare.map_or(0.0, ndf)]
+        let mut values = [0.0; 2];
+        for (value, (method, footprint)) in values.iter_mut().zip(self.methods()) {
+            *value = f64::from(method.ndf(footprint, h));
+        }
+        values
     }
 
     fn estimate(&self, sums: Sums, strategy: &'static str, points: u64) -> Estimate {
@@ -188,17 +193,16 @@ impl Problem<'_> {
     /// The draw of the given number; methods and halves take turns. `None`: it failed and counts as zero.
     fn draw(&self, index: u64) -> Option<Drawn> {
         let methods = self.methods().count() as u64;
-        let source = if index % methods == 0 {
-            self.method
-        } else {
-            self.compare.unwrap_or(self.method)
+        let (source, footprint) = match self.compare {
+            Some(compare) if index % methods != 0 => compare,
+            _ => self.method,
         };
         let half = (index / methods) % 2;
         let u = recurrence(index / methods / 2, half * methods + index % methods);
-        let h = source.sample(&self.footprint, u)?;
+        let h = source.sample(&footprint, u)?;
         let densities: f64 = self
             .methods()
-            .map(|m| f64::from(m.density(&self.footprint, h)))
+            .map(|(method, footprint)| f64::from(method.density(footprint, h)))
             .sum();
         if densities <= 0.0 {
             return None;

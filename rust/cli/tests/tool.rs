@@ -283,6 +283,85 @@ fn a_saved_structure_tells_what_it_is() {
 }
 
 #[test]
+fn interpolated_maps_are_the_surface_of_curved_elements() {
+    let folder = tempfile::tempdir().unwrap();
+    let up = |i: u32| 0.5 + 0.1 * (f64::from(i) * std::f64::consts::TAU / 16.0).sin();
+    image::Rgb32FImage::from_fn(16, 16, |u, v| image::Rgb([up(u) as f32, up(v) as f32, 1.0]))
+        .save(folder.path().join("flakes.exr"))
+        .unwrap();
+    let difference = |compare: &str, footprint: &str, more: &[&str]| {
+        let options = [
+            "--footprint",
+            footprint,
+            "--alpha",
+            "0.02",
+            "--size",
+            "32",
+            "-o",
+            "ndf.exr",
+        ];
+        let methods = ["--method", "ibm", "--compare", compare];
+        let report = ndf(folder.path(), &[&options[..], &methods, more].concat());
+        (
+            number(&report["relative_l1_difference"]),
+            report["refinement"].clone(),
+        )
+    };
+    let bilinear = &["--interpolation", "bilinear"];
+    let (same, refinement) = difference("direct", "6", &[&bilinear[..], &["--refinement", "3"]].concat());
+    assert!(same < 0.02, "{same}");
+    assert_eq!(refinement["texels_per_side"], 3);
+    // Over many periods of the map, where Yan's wider footprint makes no difference; its elements are one a texel.
+    let (curved, automatic) = difference("yan16_curved", "160", bilinear);
+    let (flat, none) = difference("yan16_curved", "160", &[]);
+    assert!(curved < 0.2 && flat > 0.4, "{curved} {flat}");
+    assert!(
+        number(&automatic["step"]) <= 1.5 && none.is_null(),
+        "{automatic} {none}"
+    );
+
+    let told = |more: &[&str]| json(folder.path(), &[&["info", "flakes.exr", "--json"], more].concat());
+    let structures = told(&[&bilinear[..], &["--alpha", "0.02,0.16", "--refinement", "4"]].concat());
+    assert_eq!(structures["structures"][1]["refinement"]["texels_per_side"], 4);
+    assert!(told(&["--alpha", "0.16"])["structures"][0]["refinement"].is_null());
+    let precompute = [
+        "precompute",
+        "ibm",
+        "flakes.exr",
+        "-o",
+        "flakes.glints",
+        "--refinement",
+        "4",
+    ];
+    succeeds(folder.path(), &[&precompute[..], bilinear].concat());
+    assert_eq!(
+        json(folder.path(), &["info", "flakes.glints", "--json"])["width"],
+        64
+    );
+    // A step that no refinement resolves is told, once, and the result is there.
+    let output = glints(
+        folder.path(),
+        &[
+            "info",
+            "flakes.exr",
+            "--alpha",
+            "0.0005",
+            bilinear[0],
+            bilinear[1],
+        ],
+    );
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        output.status.success() && message.lines().count() == 1,
+        "{message}"
+    );
+    assert!(
+        message.contains("warning") && message.contains("faceted"),
+        "{message}"
+    );
+}
+
+#[test]
 fn nothing_is_overwritten_without_being_asked() {
     let folder = folder_with_map();
     let before = std::fs::read(folder.path().join("flakes.exr")).unwrap();
@@ -337,6 +416,20 @@ fn wrong_usage_is_told_in_one_line() {
     ndf(
         &["--method", "yan16", "--distribution", "ggx"],
         &["distribution", "yan16"],
+    );
+    let bilinear = ["--interpolation", "bilinear"];
+    ndf(
+        &["--refinement", "2"],
+        &["refinement", "--interpolation bilinear"],
+    );
+    ndf(&["--interpolation", "cubic"], &["cubic", "bilinear"]);
+    ndf(
+        &[&bilinear[..], &["--refinement", "9"]].concat(),
+        &["refinement", "1 to 8"],
+    );
+    ndf(
+        &[&bilinear[..], &["--method", "yan16"]].concat(),
+        &["interpolation", "yan16_curved"],
     );
     run(
         &["ndf", "flakes.exr", "-o", "a.png", "--footprint", "-3"],

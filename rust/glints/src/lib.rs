@@ -23,3 +23,4 @@ pub mod methods;
 pub mod microfacet;
 pub mod mip_map;
 pub mod normal_map;
+pub mod refinement;

@@ -13,6 +13,7 @@ use std::path::Path;
 
 use glam::{DVec2, Vec2, Vec3};
 use image::{DynamicImage, ImageReader, Limits};
+use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 
@@ -191,10 +192,79 @@ impl NormalMap {
         low.lerp(high, t.y)
     }
 
+    /// The unit normal of [`NormalMap::interpolated`] at a position in texels.
+    pub fn interpolated_normal(&self, position: DVec2) -> Vec3 {
+        unprojected(self.interpolated(position))
+    }
+
+    /// The interpolated surface in `refinement` x `refinement` texels for each texel of this map, each with
+    /// the normal of [`NormalMap::interpolated`] at its centre; this map itself for 1.
+    ///
+    /// The result has the name and the encoding of this map. It takes `12 refinement^2` bytes a texel, and
+    /// nothing else but one row for each thread is needed to make it. A side beyond [`MAX_SIDE`] is an error.
+    pub fn refined(&self, refinement: u32) -> Result<Self> {
+        let sides = [self.width, self.height].map(|side| side.checked_mul(refinement));
+        let [Some(width @ 1..=MAX_SIDE), Some(height @ 1..=MAX_SIDE)] = sides else {
+            let reason = format!(
+                "makes more than {MAX_SIDE} texels of a side, or none, of \"{}\" with {} x {}; take another one",
+                self.name, self.width, self.height
+            );
+            return Err(Error::parameter("refinement", refinement, reason));
+        };
+        let mut refined = Self {
+            name: self.name.clone(),
+            width,
+            height,
+            encoding: self.encoding,
+            normals: Vec::new(),
+        };
+        if refinement == 1 {
+            refined.normals = self.normals.clone();
+            return Ok(refined);
+        }
+        refined.normals = vec![Vec3::ZERO; width as usize * height as usize];
+        let rows = refined.normals.par_chunks_exact_mut(width as usize).enumerate();
+        rows.for_each_init(
+            || vec![Vec2::ZERO; self.width as usize],
+            |blend, (row, normals)| self.refine_row(refinement, row as u32, blend, normals),
+        );
+        Ok(refined)
+    }
+
+    /// Row `row` of the refined map, into `normals`. `blend` has room for a row of this map.
+    fn refine_row(&self, refinement: u32, row: u32, blend: &mut [Vec2], normals: &mut [Vec3]) {
+        let line = |row: u32| &self.normals[row as usize * self.width as usize..][..self.width as usize];
+        let (below, above, t) = between_centers(row, refinement, self.height);
+        for ((blend, low), high) in blend.iter_mut().zip(line(below)).zip(line(above)) {
+            *blend = low.truncate().lerp(high.truncate(), t);
+        }
+        for (column, normal) in normals.iter_mut().enumerate() {
+            let (left, right, t) = between_centers(column as u32, refinement, self.width);
+            *normal = unprojected(blend[left as usize].lerp(blend[right as usize], t));
+        }
+    }
+
     /// Covariance of the slopes over all texels, in double precision.
     pub fn slope_covariance(&self) -> SlopeCovariance {
         slope_covariance(&self.normals)
     }
+}
+
+/// The unit normal over a point of the unit disk.
+fn unprojected(s: Vec2) -> Vec3 {
+    s.extend((1.0 - s.length_squared()).max(MIN_Z * MIN_Z).sqrt())
+}
+
+/// The two texels, of `side` that repeat, between whose centres that of refined texel `index` lies, and its
+/// distance from the first centre in texels.
+#[inline]
+fn between_centers(index: u32, refinement: u32, side: u32) -> (u32, u32, f32) {
+    // Twice the distance from the centre of texel -1, in refined texels.
+    let twice = 2 * u64::from(index) + 1 + u64::from(refinement);
+    let period = 2 * u64::from(refinement);
+    let next = (twice / period) as u32;
+    let t = (twice % period) as f32 / period as f32;
+    ((next + side - 1) % side, next % side, t)
 }
 
 /// Covariance of the slopes of unit normals, at least one, in double precision.

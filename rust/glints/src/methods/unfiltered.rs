@@ -17,7 +17,7 @@ use super::{Method, Reflection};
 use crate::flakes::FlakeModel;
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
-use crate::normal_map::{MIN_Z, NormalMap};
+use crate::normal_map::NormalMap;
 
 /// What the surface is between the centres of texels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -51,10 +51,7 @@ impl Unfiltered {
                 let (column, row) = footprint.texel();
                 self.map.normal(column, row)
             }
-            Interpolation::Bilinear => {
-                let s = self.map.interpolated(footprint.center());
-                s.extend((1.0 - s.length_squared()).max(MIN_Z * MIN_Z).sqrt())
-            }
+            Interpolation::Bilinear => self.map.interpolated_normal(footprint.center()),
         }
     }
 }
