@@ -203,11 +203,15 @@ impl Footprint {
         let Some(region) = &self.region else {
             return (self.texel, None);
         };
-        let p = region.center + (u[0] - 0.5) * region.edges[0] + (u[1] - 0.5) * region.edges[1];
+        let p = region.point(DVec2::from(u) - 0.5);
         let tile = (p / self.size).floor();
+        (self.texel_at(p), Some(region.moved(-tile * self.size)))
+    }
+
+    /// Column and row of the texel at a point in unwrapped texel coordinates.
+    pub fn texel_at(&self, point: DVec2) -> (u32, u32) {
         let texel = |x: f64, side: f64| (x.rem_euclid(side) as u32).min(side as u32 - 1);
-        let texel = (texel(p.x, self.size.x), texel(p.y, self.size.y));
-        (texel, Some(region.moved(-tile * self.size)))
+        (texel(point.x, self.size.x), texel(point.y, self.size.y))
     }
 }
 
@@ -240,6 +244,35 @@ impl Parallelogram {
             center: self.center + by,
             ..*self
         }
+    }
+
+    /// The parallelogram with edges that are so many times as long; factors are positive.
+    pub(crate) fn scaled(&self, factors: [f64; 2]) -> Self {
+        let [a, b] = self.edges;
+        let [s, t] = self.gradients;
+        Self {
+            center: self.center,
+            edges: [a * factors[0], b * factors[1]],
+            gradients: [s / factors[0], t / factors[1]],
+            area: self.area * factors[0] * factors[1],
+        }
+    }
+
+    /// Calls `visit` with the parallelogram in the coordinates of every tile of `size` that it meets.
+    pub(crate) fn for_each_tile(&self, size: DVec2, mut visit: impl FnMut(Self)) {
+        for span in self.spans(size) {
+            for column in span.touched.0..span.touched.1 {
+                let tile = DVec2::new(column as f64, span.row as f64) * size;
+                if self.coverage(tile, tile + size) != Coverage::Outside {
+                    visit(self.moved(-tile));
+                }
+            }
+        }
+    }
+
+    /// The point with the given s and t.
+    pub(crate) fn point(&self, st: DVec2) -> DVec2 {
+        self.center + st.x * self.edges[0] + st.y * self.edges[1]
     }
 
     /// Area in texels.
@@ -468,20 +501,20 @@ fn fraction_below(e: DVec2, bound: f64) -> f64 {
 }
 
 /// A convex polygon of at most eight corners: a parallelogram after four cuts.
-struct Polygon {
+pub(crate) struct Polygon {
     points: [DVec2; 8],
     len: usize,
 }
 
 impl Polygon {
-    fn new(corners: &[DVec2; 4]) -> Self {
+    pub(crate) fn new(corners: &[DVec2; 4]) -> Self {
         let mut points = [DVec2::ZERO; 8];
         points[..4].copy_from_slice(corners);
         Self { points, len: 4 }
     }
 
     /// Keeps the part where the linear function `distance` is not negative (Sutherland and Hodgman 1974).
-    fn clip(&mut self, distance: impl Fn(DVec2) -> f64) {
+    pub(crate) fn clip(&mut self, distance: impl Fn(DVec2) -> f64) {
         let mut kept = Self {
             points: [DVec2::ZERO; 8],
             len: 0,
@@ -505,6 +538,11 @@ impl Polygon {
             self.points[self.len] = p;
             self.len += 1;
         }
+    }
+
+    /// The sides, each from one corner to the next.
+    pub(crate) fn sides(&self) -> impl Iterator<Item = (DVec2, DVec2)> + use<'_> {
+        (0..self.len).map(|i| (self.points[i], self.points[(i + 1) % self.len]))
     }
 
     fn area(&self) -> f64 {

@@ -10,6 +10,7 @@
 
 use glam::DVec2;
 
+use crate::error::{Error, Result};
 use crate::footprint::Footprint;
 
 /// Largest relative deviation from the mean at which a repeated Gaussian counts as constant.
@@ -39,6 +40,18 @@ pub enum Reach {
     Local,
     /// All texels of the repeated map evenly.
     Whole,
+}
+
+/// Standard deviation of a Gaussian footprint in units of its edges, in [0.05, 4].
+///
+/// # Errors
+/// A number outside of that, as parameter `footprint_sigma`.
+pub fn checked_deviation(deviation: f32) -> Result<f64> {
+    if (0.05..=4.0).contains(&deviation) {
+        return Ok(deviation.into());
+    }
+    let reason = "must be a standard deviation in pixels in [0.05, 4]";
+    Err(Error::parameter("footprint_sigma", deviation, reason))
 }
 
 impl Symmetric {

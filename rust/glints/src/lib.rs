@@ -15,6 +15,7 @@ pub mod flake_layer;
 pub mod flake_map;
 pub mod flakes;
 pub mod footprint;
+pub mod footprint_filter;
 pub mod gaussian_footprint;
 pub mod gtr;
 pub mod half_vector;

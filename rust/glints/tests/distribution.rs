@@ -5,6 +5,7 @@ use std::ops::Range;
 use glam::{DVec2, Vec3};
 use glints::flakes::{FlakeModel, Normalization};
 use glints::footprint::Footprint;
+use glints::footprint_filter::FootprintFilter;
 use glints::half_vector::DirectionPair;
 use glints::methods::Method;
 use glints::methods::compact::CompactBinMap;
@@ -696,4 +697,146 @@ fn a_point_footprint_is_unfiltered() {
     for h in disk(40).0 {
         assert_eq!(direct.ndf(&point, h), unfiltered.ndf(&point, h));
     }
+}
+
+/// Centres and the two edges of footprints, in texels of a map of 16 x 16.
+const GAUSSIAN_FOOTPRINTS: [[f64; 6]; 4] = [
+    [5.3, 7.9, 0.6, 0.2, -0.3, 0.5],
+    [0.4, 15.8, 3.0, 0.0, 0.0, 2.0],
+    [9.1, 3.3, 4.0, 3.0, -1.0, 2.5],
+    [2.2, 2.9, 9.0, 1.0, 0.2, 0.3],
+];
+
+fn gaussian_direct(map: &NormalMap, model: FlakeModel, deviation: f32) -> Direct {
+    Direct::with_filter(map.clone(), model, FootprintFilter::gaussian(deviation).unwrap())
+}
+
+/// The distribution of normals under an untruncated Gaussian, from its covariance, summed over 24 x 24 points of every
+/// texel of 7 x 7 periods and divided by the points' sum.
+fn naive_gaussian_ndf(
+    map: &NormalMap,
+    model: &FlakeModel,
+    [cx, cy, ax, ay, bx, by]: [f64; 6],
+    deviation: f64,
+    halves: &[Vec3],
+) -> Vec<f64> {
+    const POINTS: i64 = 24;
+    let side = i64::from(map.width());
+    let variance = deviation * deviation;
+    let (xx, xy, yy) = (
+        variance * (ax * ax + bx * bx),
+        variance * (ax * ay + bx * by),
+        variance * (ay * ay + by * by),
+    );
+    let determinant = xx * yy - xy * xy;
+    let mut total = 0.0;
+    let mut sums = vec![0.0; halves.len()];
+    for y in -3 * side..4 * side {
+        for x in -3 * side..4 * side {
+            let mut weight = 0.0;
+            for i in 0..POINTS * POINTS {
+                let dx = x as f64 + ((i % POINTS) as f64 + 0.5) / POINTS as f64 - cx;
+                let dy = y as f64 + ((i / POINTS) as f64 + 0.5) / POINTS as f64 - cy;
+                weight += (-0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / determinant).exp();
+            }
+            total += weight;
+            let t = map.normal(x.rem_euclid(side) as u32, y.rem_euclid(side) as u32);
+            for (sum, &h) in sums.iter_mut().zip(halves) {
+                if weight > 1e-12 {
+                    *sum += weight * f64::from(model.ndf(h, t, 1.0));
+                }
+            }
+        }
+    }
+    sums.iter().map(|sum| sum / total).collect()
+}
+
+fn footprint_of([cx, cy, ax, ay, bx, by]: [f64; 6], size: u32, scale: f64) -> Footprint {
+    let v = |x, y| DVec2::new(x, y) * scale;
+    Footprint::in_texels(size, size, v(cx, cy), v(ax, ay), v(bx, by))
+}
+
+/// Sum of `|found - expected|` over that of `expected`.
+fn relative_distance(found: impl Iterator<Item = f32>, expected: &[f64]) -> f64 {
+    let difference: f64 = found
+        .zip(expected)
+        .map(|(found, expected)| (f64::from(found) - expected).abs())
+        .sum();
+    difference / expected.iter().sum::<f64>()
+}
+
+#[test]
+fn the_direct_sum_under_a_gaussian_is_the_naive_one() {
+    let map = gaussian_map(16, [0.3, 0.2], 5);
+    let model = model(0.08, Normalization::Projected);
+    let halves: Vec<Vec3> = disk(40).0.filter(|h| h.z > 0.8).collect();
+    let box_filter = Direct::new(map.clone(), model);
+    for deviation in [0.5_f32, 0.288_675] {
+        let direct = gaussian_direct(&map, model, deviation);
+        for case in GAUSSIAN_FOOTPRINTS {
+            let expected = naive_gaussian_ndf(&map, &model, case, deviation.into(), &halves);
+            let footprint = footprint_of(case, 16, 1.0);
+            let error = |method: &Direct| {
+                relative_distance(halves.iter().map(|&h| method.ndf(&footprint, h)), &expected)
+            };
+            let (found, twin) = (error(&direct), error(&box_filter));
+            // The truncation, and the points of a texel.
+            assert!(found < 3e-3, "{case:?} {deviation}: {found}");
+            assert!(twin > 0.02, "{case:?} {deviation}: {twin}");
+        }
+    }
+}
+
+#[test]
+fn the_gaussian_is_that_of_position_normal_mixtures() {
+    // Each texel as 16 x 16 texels of the mixture's map, whose elements then blur by 0.03 texels; small tilts, at which
+    // its lobes have the same shape.
+    const FINER: u32 = 16;
+    let map = gaussian_map(16, [0.06, 0.04], 6);
+    let finer: Vec<Vec3> = (0..(16 * FINER).pow(2))
+        .map(|i| map.normal(i % (16 * FINER) / FINER, i / (16 * FINER) / FINER))
+        .collect();
+    let finer = NormalMap::from_normals("finer", 16 * FINER, 16 * FINER, &finer).unwrap();
+    let alpha = 0.03;
+    let mixture = yan16(&finer, alpha, Elements::Flat);
+    let model = model(alpha, Normalization::Projected);
+    let (direct, box_filter) = (gaussian_direct(&map, model, 0.5), Direct::new(map.clone(), model));
+    let halves: Vec<Vec3> = disk(160).0.filter(|h| h.z > 0.98).collect();
+    for case in GAUSSIAN_FOOTPRINTS {
+        let (fine, coarse) = (
+            footprint_of(case, 16 * FINER, FINER.into()),
+            footprint_of(case, 16, 1.0),
+        );
+        let expected: Vec<f64> = halves.iter().map(|&h| mixture.ndf(&fine, h).into()).collect();
+        let error =
+            |method: &Direct| relative_distance(halves.iter().map(|&h| method.ndf(&coarse, h)), &expected);
+        let (found, twin) = (error(&direct), error(&box_filter));
+        assert!(found < 0.02, "{case:?}: {found}");
+        assert!(twin > 0.05, "{case:?}: {twin}");
+    }
+}
+
+#[test]
+fn samples_under_a_gaussian_have_their_density() {
+    let map = gaussian_map(16, [0.4, 0.3], 3);
+    let model = model(0.05, Normalization::Projected);
+    let direct = gaussian_direct(&map, model, 0.5);
+    let box_filter = Direct::new(map.clone(), model);
+    for case in GAUSSIAN_FOOTPRINTS {
+        let footprint = footprint_of(case, 16, 1.0);
+        let test = |method: &Direct| {
+            let density = |h| method.density(&footprint, h);
+            chi_square(&direct, density, &footprint, (64, [0..64, 0..64]), 5)
+        };
+        let result = test(&direct);
+        assert!(is_plausible(result), "{case:?}: {result:?}");
+        if case == GAUSSIAN_FOOTPRINTS[1] {
+            let twin = test(&box_filter);
+            assert!(!is_plausible(twin), "{case:?}: {twin:?}");
+        }
+    }
+    // A point has one texel, whatever the filter.
+    let point = footprint(16, 0.0);
+    let h = Vec3::new(0.1, 0.05, 0.99).normalize();
+    assert_eq!(direct.ndf(&point, h), box_filter.ndf(&point, h));
 }

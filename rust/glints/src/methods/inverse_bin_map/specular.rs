@@ -234,13 +234,11 @@ mod tests {
         let normalization = Normalization::Paper;
         let side = method.cells.resolution();
         let mut weights = vec![0.0; (side * side) as usize];
-        Direct::new(map.clone(), FlakeModel { flake, normalization }).for_each_block(
+        Direct::new(map.clone(), FlakeModel { flake, normalization }).for_each_texel(
             footprint,
-            |normals, weight| {
-                for &t in normals {
-                    let (column, row) = method.cells.bin(t);
-                    weights[(row * side + column) as usize] += f64::from(weight);
-                }
+            |t, weight| {
+                let (column, row) = method.cells.bin(t);
+                weights[(row * side + column) as usize] += f64::from(weight);
             },
         );
         weights

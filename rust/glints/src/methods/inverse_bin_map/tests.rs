@@ -42,11 +42,9 @@ fn build(map: &NormalMap, alpha: f32, bins: u32, leaf_size: u32) -> InverseBinMa
 fn direct_weights(map: &NormalMap, ibm: &InverseBinMap, footprint: &Footprint, h: Vec3) -> [f64; SLOTS] {
     let neighbourhood = ibm.grid.neighbourhood(h);
     let mut weights = [0.0; SLOTS];
-    Direct::new(map.clone(), ibm.model).for_each_block(footprint, |normals, weight| {
-        for &t in normals {
-            if let Some(slot) = neighbourhood.slot(ibm.grid.packed_bin(t)) {
-                weights[slot] += f64::from(weight);
-            }
+    Direct::new(map.clone(), ibm.model).for_each_texel(footprint, |t, weight| {
+        if let Some(slot) = neighbourhood.slot(ibm.grid.packed_bin(t)) {
+            weights[slot] += f64::from(weight);
         }
     });
     weights

@@ -67,7 +67,7 @@ use rayon::prelude::*;
 use super::{Method, Reflection};
 use crate::error::{Error, Result};
 use crate::footprint::Footprint;
-use crate::gaussian_footprint::{GaussianFootprint, Reach};
+use crate::gaussian_footprint::{GaussianFootprint, Reach, checked_deviation};
 use crate::half_vector::DirectionPair;
 use crate::hash::mix;
 use crate::normal_map::NormalMap;
@@ -144,10 +144,7 @@ impl Options {
             let reason = "must be an intrinsic roughness in [0.00007, 0.707]: alpha / sqrt(2)";
             return Err(Error::parameter("intrinsic", intrinsic, reason));
         }
-        if !(0.05..=4.0).contains(&footprint_sigma) {
-            let reason = "must be a standard deviation in pixels in [0.05, 4]";
-            return Err(Error::parameter("footprint_sigma", footprint_sigma, reason));
-        }
+        checked_deviation(footprint_sigma)?;
         if let Elements::Curved { refinement } = elements {
             let texels = u64::from(map.width()) * u64::from(map.height());
             let fits = refinement <= 16 && texels * u64::from(refinement).pow(2) <= 1 << 30;
