@@ -74,6 +74,10 @@ bridge::InterpolationOptions to_bridge(const InterpolationOptions &o) {
     return {o.interpolation == Interpolation::Bilinear, o.refinement};
 }
 
+bridge::FilterOptions to_bridge(const FilterOptions &o) {
+    return {o.filter == FootprintFilter::Gaussian, o.footprint_sigma};
+}
+
 Drawn from_bridge(bridge::Drawn drawn) {
     switch (drawn) {
     case bridge::Drawn::Flake:
@@ -153,19 +157,20 @@ Brdf &Brdf::operator=(Brdf &&) noexcept = default;
 Brdf::~Brdf() = default;
 
 Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, const InverseBinMapOptions &options,
-                           const InterpolationOptions &interpolation) {
+                           const InterpolationOptions &interpolation, const FilterOptions &filter) {
     return translated([&] {
         bridge::InverseBinMapOptions given{to_bridge(options.structure), options.bins, options.leaf_size,
                                            to_bridge(options.binning)};
-        return Brdf(std::make_unique<Impl>(
-            Impl{bridge::inverse_bin_map(*map.m_impl->map, to_bridge(surface), given, to_bridge(interpolation))}));
+        return Brdf(std::make_unique<Impl>(Impl{bridge::inverse_bin_map(
+            *map.m_impl->map, to_bridge(surface), given, to_bridge(interpolation), to_bridge(filter))}));
     });
 }
 
-Brdf Brdf::direct(const NormalMap &map, const SurfaceOptions &surface, const InterpolationOptions &interpolation) {
+Brdf Brdf::direct(const NormalMap &map, const SurfaceOptions &surface, const InterpolationOptions &interpolation,
+                  const FilterOptions &filter) {
     return translated([&] {
         return Brdf(std::make_unique<Impl>(
-            Impl{bridge::direct(*map.m_impl->map, to_bridge(surface), to_bridge(interpolation))}));
+            Impl{bridge::direct(*map.m_impl->map, to_bridge(surface), to_bridge(interpolation), to_bridge(filter))}));
     });
 }
 

@@ -112,6 +112,20 @@ struct GLINTS_API InterpolationOptions {
     uint32_t refinement = 0; ///< texels per texel and side, 1 to 8; 0: as many as bends and roughness ask for
 };
 
+/// How a pixel weights what lies under its footprint.
+enum class FootprintFilter : uint8_t {
+    Box,      ///< evenly over the parallelogram
+    Gaussian, ///< by a Gaussian whose axes are the parallelogram's edges, cut at 3.74 standard deviations
+};
+
+/// The filter of the direct sum; inverse bin maps answer for the box alone.
+struct GLINTS_API FilterOptions {
+    FootprintFilter filter = FootprintFilter::Box;
+    /// Standard deviation of the Gaussian in pixels (edges of the footprint), in [0.05, 4]: 0.5 is that of Yan et al.'s
+    /// published implementation, 1 / sqrt(12) has the variance of the box.
+    float footprint_sigma = 0.5f;
+};
+
 /// Parameters of Yan et al. 2016; the intrinsic roughness is `SurfaceOptions::alpha / sqrt(2)`.
 struct GLINTS_API Yan16Options {
     /// Curved elements follow the bilinearly interpolated map; flat ones have the texels' normals.
@@ -181,13 +195,13 @@ struct Statistics {
 class GLINTS_API Brdf {
 public:
     /// Inverse bin map, Atanasov et al. 2021 (Sections 5.2-5.4); with `surface.alpha = 0` that of their talk of 2020,
-    /// which needs `options.bins`.
+    /// which needs `options.bins`. A Gaussian `filter` is refused.
     static Brdf inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
                                 const InverseBinMapOptions &options = {},
-                                const InterpolationOptions &interpolation = {});
+                                const InterpolationOptions &interpolation = {}, const FilterOptions &filter = {});
     /// The exact sum over every texel of the footprint (Eq. 11).
     static Brdf direct(const NormalMap &map, const SurfaceOptions &surface,
-                       const InterpolationOptions &interpolation = {});
+                       const InterpolationOptions &interpolation = {}, const FilterOptions &filter = {});
     /// The normal under the footprint's centre (Eq. 5), whatever the footprint.
     static Brdf unfiltered(const NormalMap &map, const SurfaceOptions &surface,
                            Interpolation interpolation = Interpolation::Nearest);

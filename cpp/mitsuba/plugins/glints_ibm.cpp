@@ -67,6 +67,8 @@ Parameters of this plugin
 |             |         | at which normals of neighbours are at most 1.5 standard deviations of a flake's lobe apart   |
 |             |         | (`alpha` / sqrt(2), root mean square), as far as 8 and 8192 x 8192 texels in all go; a warn- |
 |             |         | ing tells where that is too few. Required with `alpha` = 0. (Default: 0)                     |
+| `footprint_ | string  | How the pixel weights what it covers: `box`, evenly. A `gaussian`, as `glints_direct` has    |
+| filter`     |         | it, is refused: the structures count texels of equal weight. (Default: `box`)                |
 
 Guidance
 --------
@@ -127,7 +129,8 @@ static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::No
         size_t choice = glints_mitsuba::choice_parameter(props, "binning", {"projected", "equal_solid_angle"});
         options.binning = choice == 0 ? glints::Binning::Projected : glints::Binning::EqualSolidAngle;
     }
-    return glints::Brdf::inverse_bin_map(map, surface, options, glints_mitsuba::interpolation_parameters(props));
+    return glints::Brdf::inverse_bin_map(map, surface, options, glints_mitsuba::interpolation_parameters(props),
+                                         glints_mitsuba::filter_parameters(props));
 }
 
 extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {

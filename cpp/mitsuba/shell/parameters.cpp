@@ -107,6 +107,17 @@ glints::InterpolationOptions interpolation_parameters(const Properties &props) {
     return options;
 }
 
+glints::FilterOptions filter_parameters(const Properties &props) {
+    glints::FilterOptions options;
+    options.filter = glints::FootprintFilter(choice_parameter(props, "footprint_filter", {"box", "gaussian"}));
+    if (props.has_property("footprint_sigma") && options.filter != glints::FootprintFilter::Gaussian)
+        Throw("%s: parameter \"footprint_sigma\" is the standard deviation of a Gaussian footprint; add "
+              "footprint_filter=\"gaussian\", or leave it out.",
+              props.plugin_name());
+    options.footprint_sigma = props.get<float>("footprint_sigma", options.footprint_sigma);
+    return options;
+}
+
 float roughness_parameter(const Properties &props, const char *other, float factor, float fallback) {
     if (!props.has_property(other))
         return fallback;

@@ -47,6 +47,9 @@ GLINTS_MITSUBA_API size_t choice_parameter(const mitsuba::Properties &props, con
 /// The parameters `interpolation` and `refinement` of the plugins whose map is resampled to be interpolated.
 GLINTS_MITSUBA_API glints::InterpolationOptions interpolation_parameters(const mitsuba::Properties &props);
 
+/// The parameters `footprint_filter` and `footprint_sigma` of the plugins that know more than one filter.
+GLINTS_MITSUBA_API glints::FilterOptions filter_parameters(const mitsuba::Properties &props);
+
 /// Roughness alpha from another parameter that stands for it, alpha = factor * value; `fallback` where it is not given.
 /// Both together are refused.
 GLINTS_MITSUBA_API float roughness_parameter(const mitsuba::Properties &props, const char *other, float factor,

@@ -17,6 +17,7 @@ use glints::brdf::{Brdf as Core, Masking};
 use glints::error::{Error, Result};
 use glints::flake_layer::{self, LayerMasking};
 use glints::flakes::{FlakeModel, Normalization};
+use glints::footprint_filter::FootprintFilter;
 use glints::gtr::Gtr;
 use glints::methods::Method;
 use glints::methods::compact::CompactBinMap;
@@ -122,6 +123,13 @@ mod ffi {
         refinement: u32,
     }
 
+    /// The deviation is the Gaussian's, in pixels; ignored for the box.
+    #[derive(Clone, Copy)]
+    struct FilterOptions {
+        gaussian: bool,
+        footprint_sigma: f32,
+    }
+
     #[derive(Clone, Copy)]
     struct Yan16Options {
         curved: bool,
@@ -181,8 +189,14 @@ mod ffi {
             surface: Surface,
             options: InverseBinMapOptions,
             interpolation: InterpolationOptions,
+            filter: FilterOptions,
         ) -> Result<Box<Brdf>>;
-        fn direct(map: &Map, surface: Surface, interpolation: InterpolationOptions) -> Result<Box<Brdf>>;
+        fn direct(
+            map: &Map,
+            surface: Surface,
+            interpolation: InterpolationOptions,
+            filter: FilterOptions,
+        ) -> Result<Box<Brdf>>;
         fn unfiltered(map: &Map, surface: Surface, bilinear: bool) -> Result<Box<Brdf>>;
         fn yan16(map: &Map, surface: Surface, options: Yan16Options) -> Result<Box<Brdf>>;
         fn evaluate(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> Evaluation;
@@ -271,7 +285,17 @@ fn inverse_bin_map(
     surface: ffi::Surface,
     options: ffi::InverseBinMapOptions,
     interpolation: ffi::InterpolationOptions,
+    filter: ffi::FilterOptions,
 ) -> Result<Box<Brdf>> {
+    if filter.gaussian {
+        return Err(Error::Parameter {
+            name: "footprint_filter",
+            value: "gaussian".into(),
+            reason: "an inverse bin map counts texels of equal weight, which only a box has; leave the parameter out, \
+                     or take glints_direct, or glints_yan16, whose footprint is a Gaussian"
+                .into(),
+        });
+    }
     build(map, surface, interpolation, |map| {
         if is_compact(surface, options)? {
             return Ok(Box::new(CompactBinMap::new(&map, flakes(surface)?)));
@@ -352,9 +376,19 @@ fn inverse_bin_map_options(bins: u32, leaf_size: u32) -> inverse_bin_map::Option
     }
 }
 
-fn direct(map: &Map, surface: ffi::Surface, interpolation: ffi::InterpolationOptions) -> Result<Box<Brdf>> {
+fn direct(
+    map: &Map,
+    surface: ffi::Surface,
+    interpolation: ffi::InterpolationOptions,
+    filter: ffi::FilterOptions,
+) -> Result<Box<Brdf>> {
+    let filter = match filter.gaussian {
+        true => FootprintFilter::gaussian(filter.footprint_sigma)?,
+        false => FootprintFilter::Box,
+    };
     build(map, surface, interpolation, |map| {
-        Ok(Box::new(Direct::new(map.into_owned(), flakes(surface)?)))
+        let direct = Direct::with_filter(map.into_owned(), flakes(surface)?, filter);
+        Ok(Box::new(direct))
     })
 }
 

@@ -6,6 +6,7 @@ use clap::{Args, ValueEnum};
 use glam::DVec2;
 use glints::flakes::FlakeModel;
 use glints::footprint::Footprint;
+use glints::footprint_filter::FootprintFilter;
 use glints::methods::Method;
 use glints::methods::direct::Direct;
 use glints::methods::unfiltered::{Interpolation, Unfiltered};
@@ -61,6 +62,9 @@ pub struct Arguments {
     #[command(flatten)]
     interpolation: InterpolationArguments,
 
+    #[command(flatten)]
+    filter: FilterArguments,
+
     /// Pixels per side of the picture, in 16 to 4096
     #[arg(long, value_name = "PIXELS", default_value_t = 512, value_parser = clap::value_parser!(u32).range(16..=4096))]
     size: u32,
@@ -84,6 +88,61 @@ pub struct Arguments {
     /// Print one line of JSON
     #[arg(long)]
     json: bool,
+}
+
+/// How the pixel weights what it covers.
+#[derive(Args)]
+struct FilterArguments {
+    /// How the pixel weights what it covers: `box`, evenly, or `gaussian`, which direct, yan16 and yan16_curved have
+    #[arg(long, value_enum, default_value_t)]
+    footprint_filter: FilterName,
+
+    /// Standard deviation of the Gaussian footprint in units of the footprint's edges, in 0.05 to 4: 0.5 as Yan et
+    /// al. published it, 0.288675 with the variance of the box [default: 0.5]
+    #[arg(long, value_name = "EDGES")]
+    footprint_sigma: Option<f32>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+enum FilterName {
+    #[default]
+    Box,
+    Gaussian,
+}
+
+impl FilterArguments {
+    fn sigma(&self) -> f32 {
+        self.footprint_sigma
+            .unwrap_or(yan16::Options::default().footprint_sigma)
+    }
+
+    fn filter(&self) -> Result<FootprintFilter> {
+        Ok(match self.footprint_filter {
+            FilterName::Box => FootprintFilter::Box,
+            FilterName::Gaussian => FootprintFilter::gaussian(self.sigma())?,
+        })
+    }
+
+    /// Refuses a Gaussian for a method that has none, and a deviation that no method would see.
+    fn check(&self, methods: &[MethodName]) -> Result<()> {
+        let is_mixture = |name: &MethodName| matches!(name, MethodName::Yan16 | MethodName::Yan16Curved);
+        if self.footprint_filter == FilterName::Gaussian {
+            let without = |name: &&MethodName| **name != MethodName::Direct && !is_mixture(name);
+            if let Some(&name) = methods.iter().find(without) {
+                return Err(Failure::usage(format!(
+                    "parameter \"footprint_filter\" = gaussian: {} has no such filter; take direct, yan16 or \
+                     yan16_curved, or leave the parameter out",
+                    name_of(name)
+                )));
+            }
+        } else if let (Some(sigma), false) = (self.footprint_sigma, methods.iter().any(is_mixture)) {
+            return Err(Failure::usage(format!(
+                "parameter \"footprint_sigma\" = {sigma}: is for Gaussian footprints; add --footprint-filter \
+                 gaussian, or leave it out"
+            )));
+        }
+        Ok(())
+    }
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
@@ -111,11 +170,12 @@ impl MethodName {
         map: &NormalMap,
         model: FlakeModel,
         refinement: Option<Refinement>,
+        filter: &FilterArguments,
     ) -> Result<Box<dyn Method>> {
         if self.is_resampled() {
-            return self.build_from(&*refined(map, refinement)?, model, refinement.is_some());
+            return self.build_from(&*refined(map, refinement)?, model, refinement.is_some(), filter);
         }
-        self.build_from(map, model, refinement.is_some())
+        self.build_from(map, model, refinement.is_some(), filter)
     }
 
     /// Whether an interpolated map is resampled for the method; others interpolate it themselves.
@@ -123,18 +183,24 @@ impl MethodName {
         matches!(self, Self::Direct | Self::Ibm | Self::IbmPaper)
     }
 
-    fn build_from(self, map: &NormalMap, model: FlakeModel, bilinear: bool) -> Result<Box<dyn Method>> {
+    fn build_from(
+        self,
+        map: &NormalMap,
+        model: FlakeModel,
+        bilinear: bool,
+        filter: &FilterArguments,
+    ) -> Result<Box<dyn Method>> {
         let _progress = Progress::spinner("building the structure");
         let mixture = |elements| -> Result<Box<dyn Method>> {
             let options = yan16::Options {
                 elements,
                 intrinsic: model.flake.alpha() / std::f32::consts::SQRT_2,
-                ..yan16::Options::default()
+                footprint_sigma: filter.sigma(),
             };
             Ok(Box::new(Yan16::new(map, options)?))
         };
         Ok(match self {
-            Self::Direct => Box::new(Direct::new(map.clone(), model)),
+            Self::Direct => Box::new(Direct::with_filter(map.clone(), model, filter.filter()?)),
             Self::Ibm => Box::new(structures::ibm(map, model)),
             Self::IbmPaper => structures::ibm_paper(map, model)?,
             Self::Yan16 => mixture(Elements::Flat)?,
@@ -209,20 +275,26 @@ fn parse_footprint(text: &str) -> std::result::Result<[DVec2; 2], String> {
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     let format = Format::of(&arguments.output)?;
-    for method in std::iter::once(arguments.method).chain(arguments.compare) {
+    let methods: Vec<MethodName> = std::iter::once(arguments.method)
+        .chain(arguments.compare)
+        .collect();
+    for method in &methods {
         method.check(
             arguments.flake.distribution,
             arguments.interpolation.interpolation,
         )?;
     }
     arguments.interpolation.check()?;
+    arguments.filter.check(&methods)?;
     let destination = Destination::new(&arguments.output, arguments.force, &[&arguments.map.map])?;
     let model = arguments.flake.model()?;
     let map = arguments.map.load()?;
     let refinement = arguments.interpolation.refinement(&map, model)?;
-    let method = arguments.method.build(&map, model, refinement)?;
+    let method = arguments
+        .method
+        .build(&map, model, refinement, &arguments.filter)?;
     let compare = match arguments.compare {
-        Some(name) => Some(name.build(&map, model, refinement)?),
+        Some(name) => Some(name.build(&map, model, refinement, &arguments.filter)?),
         None => None,
     };
     let over = |method: &dyn Method| footprint(arguments, &map, method.map_size());
@@ -297,6 +369,7 @@ fn report(
         "footprint_texels": footprint.edges().map(|edge| edge.to_array()),
         "alpha": decimal(arguments.flake.alpha),
         "distribution": name_of(arguments.flake.distribution),
+        "footprint_filter": name_of(arguments.filter.footprint_filter),
         "refinement": refinement_json(refinement),
         "size": arguments.size,
         "scale": [peak / 10_f32.powf(DECADES), peak],

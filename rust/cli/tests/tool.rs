@@ -283,6 +283,48 @@ fn a_saved_structure_tells_what_it_is() {
 }
 
 #[test]
+fn gaussian_footprints_are_those_of_mixtures() {
+    let folder = folder_with_map();
+    let difference = |filter: &[&str]| {
+        let options = [
+            "--footprint",
+            "20",
+            "--alpha",
+            "0.1",
+            "--size",
+            "32",
+            "-o",
+            "ndf.exr",
+        ];
+        let methods = ["--method", "direct", "--compare", "yan16"];
+        let report = ndf(folder.path(), &[&options[..], &methods, filter].concat());
+        assert_eq!(
+            report["footprint_filter"],
+            filter.get(1).copied().unwrap_or("box")
+        );
+        number(&report["relative_l1_difference"])
+    };
+    let gaussian = ["--footprint-filter", "gaussian"];
+    let (same, other) = (difference(&gaussian), difference(&[]));
+    assert!(same < 0.05 && other > 2.0 * same, "{same} {other}");
+    let wide = difference(&[&gaussian[..], &["--footprint-sigma", "1"]].concat());
+    assert!(wide < 0.05, "{wide}");
+    let wrong = [
+        "ndf",
+        "flakes.exr",
+        "-o",
+        "a.exr",
+        "--footprint",
+        "4",
+        "--footprint-filter",
+        "gaussian",
+        "--footprint-sigma",
+        "5",
+    ];
+    fails(folder.path(), &wrong, 2, &["footprint_sigma", "0.05"]);
+}
+
+#[test]
 fn interpolated_maps_are_the_surface_of_curved_elements() {
     let folder = tempfile::tempdir().unwrap();
     let up = |i: u32| 0.5 + 0.1 * (f64::from(i) * std::f64::consts::TAU / 16.0).sin();
@@ -430,6 +472,20 @@ fn wrong_usage_is_told_in_one_line() {
     ndf(
         &[&bilinear[..], &["--method", "yan16"]].concat(),
         &["interpolation", "yan16_curved"],
+    );
+    let gaussian = ["--footprint-filter", "gaussian"];
+    ndf(&["--footprint-filter", "tent"], &["tent", "box", "gaussian"]);
+    ndf(
+        &[&gaussian[..], &["--method", "ibm"]].concat(),
+        &["footprint_filter", "ibm", "direct"],
+    );
+    ndf(
+        &[&gaussian[..], &["--compare", "unfiltered"]].concat(),
+        &["footprint_filter", "unfiltered"],
+    );
+    ndf(
+        &["--footprint-sigma", "0.3"],
+        &["footprint_sigma", "--footprint-filter gaussian"],
     );
     run(
         &["ndf", "flakes.exr", "-o", "a.png", "--footprint", "-3"],
