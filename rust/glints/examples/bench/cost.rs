@@ -88,7 +88,7 @@ fn pdf(brdf: &Brdf, q: &Query) -> f32 {
     brdf.pdf(&q.footprint, q.wi, q.wo)
 }
 
-fn sample(brdf: &Brdf, q: &Query) -> f32 {
+pub fn sample(brdf: &Brdf, q: &Query) -> f32 {
     brdf.sample(&q.footprint, q.wi, q.u)
         .map_or(0.0, |s| s.evaluation.value)
 }

@@ -13,6 +13,7 @@
 //!   alive after the build and was not before, the map left out; `*/build_peak` the most that was alive during it.
 //! * `*/build` wall-clock time, with all cores; `*/build_cpu` processor time of the whole process.
 //! * `*/eval`, `*/pdf`, `*/sample`, `*/three_calls` processor time of the thread for a query.
+//! * `direct_gaussian/eval`, `/sample` the direct sum under a Gaussian of half a pixel, against the box's.
 //! * `*/ndf_error` relative L1 distance to the direct sum, where that takes no more than [`cost::LARGEST_DIRECT`] texels;
 //!   larger footprints have no such row.
 //! * `*/eval/worst`, `/median`, `/worst_over_best`, `*/ndf_error/worst` over all cells (roughness and footprint) of the map;
@@ -29,6 +30,7 @@ use clap::Parser;
 use glints::brdf::{Brdf, Masking};
 use glints::error::Result;
 use glints::flakes::{FlakeModel, Normalization};
+use glints::footprint_filter::FootprintFilter;
 use glints::methods::Method;
 use glints::methods::compact::CompactBinMap;
 use glints::methods::direct::Direct;
@@ -133,9 +135,11 @@ fn measure(
     let ours = brdf(Box::new(ours.method))?;
     let published = brdf(Box::new(published.method))?;
     let direct = brdf(Box::new(direct))?;
+    let filter = FootprintFilter::gaussian(yan16::Options::default().footprint_sigma)?;
+    let gaussian = brdf(Box::new(Direct::with_filter(map.clone(), model, filter)))?;
     for cell in &arguments.footprint {
         let params = with(params, &cell.params());
-        let eval = measure_queries(arguments, [&ours, &published, &direct], cell, &params);
+        let eval = measure_queries(arguments, [&ours, &published, &direct, &gaussian], cell, &params);
         for (summary, nanoseconds) in summaries.iter_mut().zip(eval) {
             summary.evals.push((nanoseconds, params.clone()));
         }
@@ -173,7 +177,7 @@ fn measure_structures(
 /// Prints what the queries of a cell cost; returns the evaluations' of the compact and of the published structure.
 fn measure_queries(
     arguments: &Arguments,
-    [ours, published, direct]: [&Brdf; 3],
+    [ours, published, direct, gaussian]: [&Brdf; 4],
     cell: &Cell,
     params: &Value,
 ) -> [f64; 2] {
@@ -192,6 +196,12 @@ fn measure_queries(
     if cell.is_direct() {
         let exact = nanoseconds(direct, cost::eval);
         print("direct/eval", exact, "nanoseconds", ("ibm", evals[0]), params);
+        let eval = nanoseconds(gaussian, cost::eval);
+        let name = "direct_gaussian/eval";
+        print(name, eval, "nanoseconds", ("direct", exact), params);
+        let sample = [gaussian, direct].map(|brdf| nanoseconds(brdf, cost::sample));
+        let name = "direct_gaussian/sample";
+        print(name, sample[0], "nanoseconds", ("direct", sample[1]), params);
     }
     evals
 }
