@@ -1,9 +1,10 @@
 // Glints in a renderer of your own: load a normal map, ask for values, draw samples, check the energy.
 //
-//     example_host MAP [ALPHA] [FOOTPRINT]
+//     example_host MAP [ALPHA] [FOOTPRINT] [SAMPLES]
 //
 // MAP is a normal map (EXR, PNG, JPEG or TIFF), ALPHA the Beckmann roughness of a flake (0.02), FOOTPRINT the width of a
-// square pixel footprint in texels (16). Exits with 1 if the energy is off and with 2 if the input is unusable.
+// square pixel footprint in texels (16), SAMPLES how many directions are drawn (200000). Exits with 1 if the energy is off
+// and with 2 if the input is unusable.
 // See CMakeLists.txt beside this file for building it.
 
 #include <glints/glints.h>
@@ -60,7 +61,7 @@ bool check_distribution(const glints::Brdf &brdf, const ShadingPoint &point, flo
 
 /// In a uniformly bright environment (a white furnace) the reflected share of the light, without Fresnel losses, must
 /// come out alike whether directions are integrated or drawn: `sample`, `pdf` and `evaluate` fit together.
-bool check_energy(const glints::Brdf &brdf, const ShadingPoint &point, float alpha) {
+bool check_energy(const glints::Brdf &brdf, const ShadingPoint &point, float alpha, int samples) {
     double integrated = integrate_half_vectors(alpha, [&](const Vec3 &h) {
         if (dot(point.wi, h) <= 0.f)
             return 0.f;
@@ -68,7 +69,6 @@ bool check_energy(const glints::Brdf &brdf, const ShadingPoint &point, float alp
         return brdf.value(point.footprint, point.wi, wo) * 4.f * dot(wo, h) / h.z;
     });
 
-    const int samples = 200000;
     std::mt19937 random(1);
     std::uniform_real_distribution<float> uniform(0.f, 1.f);
     double sum = 0.0, sum_of_squares = 0.0;
@@ -108,11 +108,16 @@ void print_answers(const glints::Brdf &brdf, const ShadingPoint &point) {
 
 int main(int argc, char **argv) {
     if (argc < 2) {
-        std::fprintf(stderr, "usage: %s MAP [ALPHA] [FOOTPRINT]\n", argv[0]);
+        std::fprintf(stderr, "usage: %s MAP [ALPHA] [FOOTPRINT] [SAMPLES]\n", argv[0]);
         return 2;
     }
     float alpha = argc > 2 ? (float) std::atof(argv[2]) : 0.02f;
     float texels = argc > 3 ? (float) std::atof(argv[3]) : 16.f;
+    int samples = argc > 4 ? std::atoi(argv[4]) : 200000;
+    if (samples < 1) {
+        std::fprintf(stderr, "SAMPLES is %s; it must be a positive number\n", argv[4]);
+        return 2;
+    }
 
     try {
         // Once per material.
@@ -129,7 +134,7 @@ int main(int argc, char **argv) {
 
         print_answers(brdf, point);
         bool distribution_ok = check_distribution(brdf, point, alpha);
-        bool energy_ok = check_energy(brdf, point, alpha);
+        bool energy_ok = check_energy(brdf, point, alpha, samples);
         return distribution_ok && energy_ok ? 0 : 1;
     } catch (const glints::Error &e) {
         std::fprintf(stderr, "%s\n", e.what());
