@@ -8,6 +8,8 @@
 //!
 //! Validation happens here, once: components are finite, lengths are not zero, and every normal points out of
 //! the surface (`z >= MIN_Z`). Methods rely on it and check nothing again.
+//!
+//! A map takes 12 bytes a texel, and loading it 24 for a moment: the decoded image, and the normals.
 
 use std::path::Path;
 
@@ -50,7 +52,7 @@ pub struct NormalMap {
 }
 
 /// Covariance of the map's slopes (-x/z, -y/z), every texel weighted alike.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SlopeCovariance {
     pub xx: f64,
     pub xy: f64,
@@ -74,22 +76,25 @@ impl NormalMap {
                 reason: "has fewer than three channels; a normal map needs red, green and blue".into(),
             });
         }
-        let texels = image.into_rgb32f().into_raw();
+        let components = image.into_rgb32f().into_raw();
         let encoding = match encoding {
-            Encoding::Automatic if is_float && texels.iter().any(|&c| c < 0.0) => Encoding::Signed,
+            Encoding::Automatic if is_float && components.iter().any(|&c| c < 0.0) => Encoding::Signed,
             Encoding::Automatic => Encoding::Unsigned,
             given => given,
         };
         let signed = encoding == Encoding::Signed;
         let flip = if flip_y { -1.0 } else { 1.0 };
         let decode_component = |c: f32| if signed { c } else { 2.0 * c - 1.0 };
-        let vectors = texels.chunks_exact(3).map(|c| {
+        let vectors = components.chunks_exact(3).map(|c| {
             Vec3::new(
                 decode_component(c[0]),
                 flip * decode_component(c[1]),
                 decode_component(c[2]),
             )
         });
+        // Of known length, so that it does not grow; the decoded image goes before normals are made, in place.
+        let vectors: Vec<Vec3> = vectors.collect();
+        drop(components);
         // An 8-bit "no normal" (128, 128, 128) decodes to length 0.007, not to zero.
         let min_length = if signed { 1e-6 } else { 1e-2 };
         let mut map = Self::from_vectors(path.display().to_string(), width, height, vectors, min_length)?;
@@ -108,14 +113,15 @@ impl NormalMap {
             );
             return Err(Error::Map { map: name, reason });
         }
-        Self::from_vectors(name, width, height, normals.iter().copied(), 1e-6)
+        Self::from_vectors(name, width, height, normals.to_vec(), 1e-6)
     }
 
+    /// Normalises `normals` in place.
     fn from_vectors(
         name: String,
         width: u32,
         height: u32,
-        vectors: impl Iterator<Item = Vec3>,
+        mut normals: Vec<Vec3>,
         min_length: f32,
     ) -> Result<Self> {
         let invalid = |reason: String| Error::Map {
@@ -127,18 +133,15 @@ impl NormalMap {
                 "is {width} x {height} texels; a side must have 1 to {MAX_SIDE}"
             )));
         }
-        let normals = vectors
-            .enumerate()
-            .map(|(index, vector)| {
-                unit_normal(vector, min_length).map_err(|problem| {
-                    let (column, row) = (index % width as usize, index / width as usize);
-                    invalid(format!(
-                        "texel (column {column}, row {row}) decodes to ({}, {}, {}), {problem}",
-                        vector.x, vector.y, vector.z
-                    ))
-                })
-            })
-            .collect::<Result<Vec<_>>>()?;
+        for (index, normal) in normals.iter_mut().enumerate() {
+            *normal = unit_normal(*normal, min_length).map_err(|problem| {
+                let (column, row) = (index % width as usize, index / width as usize);
+                invalid(format!(
+                    "texel (column {column}, row {row}) decodes to ({}, {}, {}), {problem}",
+                    normal.x, normal.y, normal.z
+                ))
+            })?;
+        }
         Ok(Self {
             name,
             width,
