@@ -89,17 +89,34 @@ Drawn from_bridge(bridge::Drawn drawn) {
     }
 }
 
+Distribution from_bridge(bridge::FlakeDistribution distribution) {
+    return distribution == bridge::FlakeDistribution::Ggx ? Distribution::Ggx : Distribution::Beckmann;
+}
+
 Statistics from_bridge(const bridge::Statistics &s) {
-    return {std::string(s.method), s.alpha,           s.structure_bytes, s.build_seconds,   s.bins,
-            s.refinement,          s.refinement_step, s.masking_alpha_u, s.masking_alpha_v, std::string(s.warning)};
+    Statistics statistics{};
+    statistics.method = std::string(s.method);
+    statistics.width = s.width;
+    statistics.height = s.height;
+    statistics.alpha = s.alpha;
+    statistics.distribution = from_bridge(s.distribution);
+    statistics.structure_bytes = s.structure_bytes;
+    statistics.build_seconds = s.build_seconds;
+    statistics.bins = s.bins;
+    statistics.refinement = s.refinement;
+    statistics.refinement_step = s.refinement_step;
+    statistics.masking_alpha_u = s.masking_alpha_u;
+    statistics.masking_alpha_v = s.masking_alpha_v;
+    statistics.warning = std::string(s.warning);
+    return statistics;
 }
 
 // A Rust string holds nothing else.
-rust::Str utf8(const std::string &filename) {
+rust::Str utf8(const std::string &filename, const char *parameter = "filename") {
     try {
         return rust::Str(filename);
     } catch (const std::invalid_argument &) {
-        throw Error("filename \"" + filename + "\": is not valid UTF-8; rename the file");
+        throw Error(std::string(parameter) + " \"" + filename + "\": is not valid UTF-8; rename the file");
     }
 }
 
@@ -163,6 +180,24 @@ Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, 
                                            to_bridge(options.binning)};
         return Brdf(std::make_unique<Impl>(Impl{bridge::inverse_bin_map(
             *map.m_impl->map, to_bridge(surface), given, to_bridge(interpolation), to_bridge(filter))}));
+    });
+}
+
+SavedStructure SavedStructure::read(const std::string &structure_file) {
+    return translated([&] {
+        bridge::SavedStructure s = bridge::saved_structure(utf8(structure_file, "structure_file"));
+        return SavedStructure{s.width, s.height, s.alpha, from_bridge(s.distribution),
+                              s.projected ? Normalization::Projected : Normalization::Paper};
+    });
+}
+
+Brdf Brdf::load_inverse_bin_map(const std::string &structure_file, const SurfaceOptions &surface,
+                                const NormalMap *map) {
+    return translated([&] {
+        rust::Str file = utf8(structure_file, "structure_file");
+        bridge::Surface given = to_bridge(surface);
+        return Brdf(std::make_unique<Impl>(Impl{map ? bridge::load_inverse_bin_map_of(*map->m_impl->map, file, given)
+                                                    : bridge::load_inverse_bin_map(file, given)}));
     });
 }
 

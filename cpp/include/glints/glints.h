@@ -178,12 +178,25 @@ private:
     friend class FlakeLayer;
 };
 
+/// What a structure was made for that `glints precompute ibm` saved.
+struct GLINTS_API SavedStructure {
+    uint32_t width, height; ///< of the map, with `refinement` texels for each of an interpolated one
+    float alpha;
+    Distribution distribution;
+    Normalization normalization;
+
+    /// Reads the beginning of the file.
+    static SavedStructure read(const std::string &structure_file);
+};
+
 /// What a method built, for tables and logs.
 struct Statistics {
     std::string method;
+    uint32_t width, height;                 ///< of the map
     float alpha;                            ///< roughness of a flake; 0: a mirror
+    Distribution distribution;              ///< of a flake's microfacets
     uint64_t structure_bytes;               ///< memory that `evaluate`, `pdf` and `sample` need
-    double build_seconds;                   ///< wall time of the construction, without reading the file
+    double build_seconds;                   ///< wall time of the construction, without reading the map
     uint32_t bins;                          ///< bins per side; 0 for methods without bins
     uint32_t refinement;                    ///< elements or refined texels per texel and side; 0 without
     float refinement_step;                  ///< their mean step in standard deviations of a lobe; 0 without
@@ -199,6 +212,13 @@ public:
     static Brdf inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
                                 const InverseBinMapOptions &options = {},
                                 const InterpolationOptions &interpolation = {}, const FilterOptions &filter = {});
+    /// The same from a file of `glints precompute ibm`, which is mapped into memory: it may be replaced or removed later, but
+    /// must not be written to or shortened. `surface.alpha`, `distribution` and `normalization` must be those of the file,
+    /// see `SavedStructure`. `map` may be null; otherwise it must be the map that the file was made from, and `Masking::
+    /// Beckmann` is made of its slopes instead of those in the file, which are quantised (and of an interpolated map, those
+    /// of the refined one).
+    static Brdf load_inverse_bin_map(const std::string &structure_file, const SurfaceOptions &surface,
+                                     const NormalMap *map = nullptr);
     /// The exact sum over every texel of the footprint (Eq. 11).
     static Brdf direct(const NormalMap &map, const SurfaceOptions &surface,
                        const InterpolationOptions &interpolation = {}, const FilterOptions &filter = {});

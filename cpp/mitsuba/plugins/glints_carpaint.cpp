@@ -228,6 +228,8 @@ static glints::FlakeLayer make_layer(const Parameters &parameters, const PaintPa
     options.gtr_gamma = paint.gtr_gamma;
     options.gtr_alpha = paint.gtr_alpha;
     options.largest_sine = 1.f / paint.eta;
+    Log(Info, "%s: \"%s\", building the structure of %u x %u texels …", parameters.plugin, parameters.filename,
+        map.width(), map.height());
     try {
         return glints::FlakeLayer::inverse_bin_map(map, parameters.surface, options);
     } catch (const glints::Error &e) {

@@ -47,6 +47,9 @@ Parameters of this plugin
 
 | Parameter   | Type    | Meaning                                                                                      |
 |-------------|---------|----------------------------------------------------------------------------------------------|
+| `structure_ | string  | A structure that `./scripts/glints precompute ibm MAP -o FILE` saved. It is mapped into      |
+| file`       |         | memory, and nothing is built; `filename` is not needed. `alpha`, `distribution` and          |
+|             |         | `normalization` are those of the file: leave them out, others are refused. (Default: none)   |
 | `structure` | string  | `compact`: this project's structure, half as large, with lobes where the map has them.       |
 |             |         | `paper`: that of the publication, lobes at the centres of bins. (Default: `compact`; `paper` |
 |             |         | where one of the following parameters is given or `alpha` is 0: they are the paper's alone)  |
@@ -73,6 +76,12 @@ Parameters of this plugin
 Guidance
 --------
 
+- `structure_file` stands for the map, its interpolation and the flakes. If `filename` is given, too, its normals are
+  compared with those in the file, at the cost of reading the map, and so are `interpolation` and `refinement`. The map's
+  `beckmann` masking is then made of its own slopes, and images are bit for bit those of a structure that is built;
+  without `filename`, of the slopes in the file: those of its quantised normals, which makes a relative difference of
+  less than 3e-4, or of an interpolated map those of the refined one. The file may be replaced while it is in use
+  (`precompute --force` does), but must not be written to. Several BSDFs and processes share one copy of it in memory.
 - `alpha` is the roughness of a single flake, not of the surface: that comes from the map. 0.0025 gives hard, sparse
   glints, 0.16 a smooth look with hardly any. Half of it asks for four times the bins.
 - `distribution` = `ggx`: a lobe is cut off at seven times its roughness, 2 % of it lie outside and are moved inside. In the
@@ -101,6 +110,11 @@ XML:
         <float name="alpha" value="0.007"/>
         <float name="tiles" value="8"/>
         <string name="material" value="Al"/>
+    </bsdf>
+
+    <bsdf type="glints_ibm">
+        <string name="structure_file" value="flakes.glints"/>
+        <float name="tiles" value="8"/>
     </bsdf>
 
 Python:
@@ -133,6 +147,55 @@ static glints::Brdf make_brdf(const mitsuba::Properties &props, const glints::No
                                          glints_mitsuba::filter_parameters(props));
 }
 
+/// The interpolation that a scene asks for must be that of the file; `found` texels for each, or 0.
+static void check_interpolation(const mitsuba::Properties &props, const std::string &file, uint32_t found) {
+    glints::InterpolationOptions asked = glints_mitsuba::interpolation_parameters(props);
+    bool is_bilinear = asked.interpolation == glints::Interpolation::Bilinear;
+    if (props.has_property("interpolation") && is_bilinear != (found > 0))
+        throw glints::Error("parameter \"interpolation\" is not what structure_file \"" + file +
+                            "\" was made for, \"" + (found > 0 ? "bilinear" : "nearest") +
+                            "\"; leave it out, or make another file with " +
+                            "`glints precompute ibm --interpolation`");
+    if (asked.refinement > 0 && asked.refinement != found)
+        throw glints::Error("parameter \"refinement\" = " + std::to_string(asked.refinement) +
+                            ": is not what structure_file \"" + file + "\" was made for, " + std::to_string(found) +
+                            "; leave it out, or make another file with `glints precompute ibm --refinement`");
+}
+
+static glints::Brdf load_brdf(const mitsuba::Properties &props, const glints::NormalMap *map,
+                              const glints::SurfaceOptions &common) {
+    const char *name = "structure_file";
+    glints_mitsuba::refuse_together(props, name, {"bins", "leaf_size", "binning"},
+                                    "the file holds the compact structure, which has none; leave one of them out");
+    if (props.has_property("structure") && glints_mitsuba::choice_parameter(props, "structure", {"compact", "paper"}))
+        glints_mitsuba::refuse_together(props, name, {"structure"},
+                                        "the file holds the compact structure; leave one of them out");
+    if (glints_mitsuba::filter_parameters(props).filter == glints::FootprintFilter::Gaussian)
+        glints_mitsuba::refuse_together(props, name, {"footprint_filter"},
+                                        "an inverse bin map has no Gaussian footprint; leave one of them out");
+    if (!map) {
+        glints_mitsuba::refuse_together(
+            props, name, {"encoding", "flip_y"},
+            "nothing is read but the file; leave one of them out, or give \"filename\", too");
+        glints_mitsuba::refuse_together(props, name, {"interpolation", "refinement"},
+                                        "the file stands for the surface, interpolated or not, as `glints precompute` "
+                                        "was told; leave one of them out, or give \"filename\", too, to compare");
+    }
+
+    glints::SurfaceOptions surface = common; // what a scene leaves open is as the file was made for
+    std::string file = glints_mitsuba::structure_file(props);
+    glints::SavedStructure saved = glints::SavedStructure::read(file);
+    if (!props.has_property("alpha"))
+        surface.alpha = saved.alpha;
+    if (!props.has_property("distribution"))
+        surface.distribution = saved.distribution;
+    if (!props.has_property("normalization"))
+        surface.normalization = saved.normalization;
+    glints::Brdf brdf = glints::Brdf::load_inverse_bin_map(file, surface, map);
+    check_interpolation(props, file, brdf.statistics().refinement);
+    return brdf;
+}
+
 extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {
-    glints_mitsuba::register_bsdf(name, fn, {make_brdf, glints_mitsuba::Footprints::Used});
+    glints_mitsuba::register_bsdf(name, fn, {make_brdf, glints_mitsuba::Footprints::Used, load_brdf});
 }

@@ -12,6 +12,7 @@
 #include <mitsuba/core/util.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/texture.h>
+#include <optional>
 
 namespace glints_mitsuba {
 
@@ -19,13 +20,31 @@ using namespace mitsuba;
 
 namespace {
 
-glints::Brdf make_brdf(const Method &method, const Properties &props, const Parameters &parameters,
-                       const glints::NormalMap &map) {
+/// Loads the structure where the method can and the scene names one, else builds it from the map.
+glints::Brdf make_brdf(const Method &method, const Properties &props, const Parameters &parameters) {
+    bool is_saved = method.load_brdf && props.has_property("structure_file");
+    std::optional<glints::NormalMap> map;
+    if (!is_saved || !parameters.filename.empty())
+        map = load_map(parameters);
     try {
-        return method.make_brdf(props, map, parameters.surface);
+        if (is_saved)
+            return method.load_brdf(props, map ? &*map : nullptr, parameters.surface);
+        // That a large map takes its time is said first. (From here: a thread of its own would wait for Python's lock.)
+        Log(Info, "%s: \"%s\", building the structure of %u x %u texels …", parameters.plugin, parameters.filename,
+            map->width(), map->height());
+        return method.make_brdf(props, *map, parameters.surface);
     } catch (const glints::Error &e) {
+        if (!map)
+            Throw("%s: %s", parameters.plugin, e.what());
         Throw("%s: %s (normal map \"%s\")", parameters.plugin, e.what(), parameters.filename);
     }
+}
+
+/// What the surface comes from, for messages: the saved structure, if there is one, or the map.
+std::string source(const Method &method, const Properties &props, const Parameters &parameters) {
+    if (method.load_brdf && props.has_property("structure_file"))
+        return structure_file(props);
+    return parameters.filename;
 }
 
 const char *distribution_name(glints::Distribution distribution) {
@@ -100,9 +119,9 @@ public:
         std::ostringstream out;
         out << "GlintBSDF[\n"
             << "  plugin = " << m_parameters.plugin << ",\n"
-            << "  filename = \"" << m_parameters.filename << "\",\n"
-            << "  resolution = " << m_width << " x " << m_height << ",\n"
-            << "  distribution = " << distribution_name(m_parameters.surface.distribution) << ",\n"
+            << "  filename = \"" << m_source << "\",\n"
+            << "  resolution = " << s.width << " x " << s.height << ",\n"
+            << "  distribution = " << distribution_name(s.distribution) << ",\n"
             << "  alpha = " << s.alpha << ",\n"
             << "  tiles = " << m_parameters.tiles << ",\n"
             << "  to_uv = " << string::indent(m_parameters.to_uv.matrix, 10) << ",\n"
@@ -120,12 +139,10 @@ public:
     MI_DECLARE_CLASS(GlintBSDF)
 
 private:
-    GlintBSDF(const Properties &props, Parameters parameters) : GlintBSDF(props, parameters, load_map(parameters)) {}
-
-    GlintBSDF(const Properties &props, const Parameters &parameters, const glints::NormalMap &map)
+    GlintBSDF(const Properties &props, const Parameters &parameters)
         : Base(props), m_parameters(parameters), m_method(find_method(parameters.plugin)),
-          m_brdf(make_brdf(m_method, props, parameters, map)), m_uv_footprint(parameters),
-          m_reflectance(props, parameters), m_width(map.width()), m_height(map.height()),
+          m_source(source(m_method, props, parameters)), m_brdf(make_brdf(m_method, props, parameters)),
+          m_uv_footprint(parameters), m_reflectance(props, parameters),
           m_warnings(described(props), m_method.footprints == Footprints::Used) {
         m_flags =
             BSDFFlags::GlossyReflection | BSDFFlags::FrontSide | BSDFFlags::SpatiallyVarying | BSDFFlags::Anisotropic;
@@ -138,10 +155,11 @@ private:
 
     void log_statistics() const {
         glints::Statistics s = m_brdf.statistics();
-        Log(Info, "%s: \"%s\", %u x %u texels, %s, built in %s.", m_parameters.plugin, m_parameters.filename, m_width,
-            m_height, util::mem_string(s.structure_bytes), util::time_string((float) (1e3 * s.build_seconds), true));
+        const char *made = m_source == m_parameters.filename ? "built" : "loaded";
+        Log(Info, "%s: \"%s\", %u x %u texels, %s, %s in %s.", m_parameters.plugin, m_source, s.width, s.height,
+            util::mem_string(s.structure_bytes), made, util::time_string((float) (1e3 * s.build_seconds), true));
         if (!s.warning.empty())
-            Log(Warn, "%s: \"%s\": %s.", m_parameters.plugin, m_parameters.filename, s.warning);
+            Log(Warn, "%s: \"%s\": %s.", m_parameters.plugin, m_source, s.warning);
     }
 
     static bool above_horizon(const Vector3f &w) { return Frame3f::cos_theta(w) > 0.f; }
@@ -165,10 +183,10 @@ private:
 
     Parameters m_parameters;
     Method m_method;
+    std::string m_source;
     glints::Brdf m_brdf;
     UvFootprint m_uv_footprint;
     Reflectance<Float, Spectrum> m_reflectance;
-    uint32_t m_width, m_height;
     InputWarnings<Float, Spectrum> m_warnings;
 };
 

@@ -118,6 +118,16 @@ glints::FilterOptions filter_parameters(const Properties &props) {
     return options;
 }
 
+std::string structure_file(const Properties &props) {
+    return file_resolver()->resolve(props.get<std::string_view>("structure_file")).string();
+}
+
+void refuse_together(const Properties &props, const char *a, std::initializer_list<const char *> others,
+                     const char *advice) {
+    if (const char *other = first_given(props, others))
+        refuse_conflict(props, a, other, advice);
+}
+
 float roughness_parameter(const Properties &props, const char *other, float factor, float fallback) {
     if (!props.has_property(other))
         return fallback;
@@ -131,6 +141,9 @@ float roughness_parameter(const Properties &props, const char *other, float fact
 }
 
 glints::NormalMap load_map(const Parameters &parameters) {
+    if (parameters.filename.empty())
+        Throw("%s: parameter \"filename\" is missing: give the path of a normal map (EXR, PNG, JPEG or TIFF).",
+              parameters.plugin);
     try {
         return glints::NormalMap::load(parameters.filename, parameters.encoding, parameters.flip_y);
     } catch (const glints::Error &e) {
@@ -152,11 +165,8 @@ Parameters::Parameters(const Properties &props) : plugin(props.plugin_name()) {
 }
 
 void Parameters::read_map(const Properties &props) {
-    if (!props.has_property("filename"))
-        Throw("%s: parameter \"filename\" is missing: give the path of a normal map (EXR, PNG, JPEG or TIFF).",
-              plugin);
-    filename = file_resolver()->resolve(props.get<std::string_view>("filename")).string();
-
+    if (props.has_property("filename"))
+        filename = file_resolver()->resolve(props.get<std::string_view>("filename")).string();
     encoding = glints::Encoding(choice_parameter(props, "encoding", {"auto", "unsigned", "signed"}));
     flip_y = props.get<bool>("flip_y", false);
 }

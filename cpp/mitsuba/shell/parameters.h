@@ -25,7 +25,7 @@ struct GLINTS_MITSUBA_API Parameters {
     explicit Parameters(const mitsuba::Properties &props);
 
     std::string plugin;
-    std::string filename; ///< as the file resolver found it
+    std::string filename; ///< as the file resolver found it; empty: not given
     glints::Encoding encoding = glints::Encoding::Automatic;
     bool flip_y = false;
     glints::SurfaceOptions surface;
@@ -47,7 +47,7 @@ private:
     void read_dielectric(const mitsuba::Properties &props);
 };
 
-/// The normal map that the parameters name.
+/// The normal map that the parameters name; an error if they name none.
 GLINTS_MITSUBA_API glints::NormalMap load_map(const Parameters &parameters);
 
 /// A plugin and, if it has one, its name in the scene: `glints_ibm "flakes"`.

@@ -7,6 +7,7 @@
 #include <glints/glints.h>
 #include <initializer_list>
 #include <mitsuba/core/properties.h>
+#include <string>
 #include <string_view>
 
 // GCC and Clang: visible both when building libglints_mitsuba.so and when using it.
@@ -18,12 +19,18 @@ namespace glints_mitsuba {
 using BrdfFactory = glints::Brdf (*)(const mitsuba::Properties &props, const glints::NormalMap &map,
                                      const glints::SurfaceOptions &surface);
 
+/// Loads the BRDF of one method from the file that the parameter `structure_file` names. `map`: null where the scene names
+/// no normal map.
+using BrdfLoader = glints::Brdf (*)(const mitsuba::Properties &props, const glints::NormalMap *map,
+                                    const glints::SurfaceOptions &surface);
+
 /// Does a method look at more than the centre of the footprint?
 enum class Footprints { Used, Ignored };
 
 struct Method {
     BrdfFactory make_brdf;
     Footprints footprints;
+    BrdfLoader load_brdf = nullptr; ///< null: the method's structures are not saved
 };
 
 /// Offers a BSDF plugin to Mitsuba in all supported variants. Called by the plugin's `init_plugin`.
@@ -49,6 +56,13 @@ GLINTS_MITSUBA_API glints::InterpolationOptions interpolation_parameters(const m
 
 /// The parameters `footprint_filter` and `footprint_sigma` of the plugins that know more than one filter.
 GLINTS_MITSUBA_API glints::FilterOptions filter_parameters(const mitsuba::Properties &props);
+
+/// The file that the parameter `structure_file` names, as the file resolver finds it.
+GLINTS_MITSUBA_API std::string structure_file(const mitsuba::Properties &props);
+
+/// Refuses the parameter `a`, which is given, beside the first of the others that is given, too.
+GLINTS_MITSUBA_API void refuse_together(const mitsuba::Properties &props, const char *a,
+                                        std::initializer_list<const char *> others, const char *advice);
 
 /// Roughness alpha from another parameter that stands for it, alpha = factor * value; `fallback` where it is not given.
 /// Both together are refused.

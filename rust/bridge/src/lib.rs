@@ -10,6 +10,7 @@
 
 use std::borrow::Cow;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
 use std::time::Instant;
 
 use glam::Vec3;
@@ -29,6 +30,7 @@ use glints::microfacet::{Distribution, Flake};
 use glints::mip_map::MipMap;
 use glints::normal_map::{Encoding, NormalMap};
 use glints::refinement::Refinement;
+use glints::saved::{self, Flakes, SavedMap};
 
 #[cxx::bridge(namespace = "glints::bridge")]
 mod ffi {
@@ -116,6 +118,15 @@ mod ffi {
         binning: BinningKind,
     }
 
+    /// What a saved structure was made for.
+    struct SavedStructure {
+        width: u32,
+        height: u32,
+        distribution: FlakeDistribution,
+        alpha: f32,
+        projected: bool,
+    }
+
     /// Refinement of zero: as many texels as the map needs.
     #[derive(Clone, Copy)]
     struct InterpolationOptions {
@@ -162,7 +173,10 @@ mod ffi {
 
     struct Statistics {
         method: String,
+        width: u32,
+        height: u32,
         alpha: f32,
+        distribution: FlakeDistribution,
         structure_bytes: u64,
         build_seconds: f64,
         bins: u32,
@@ -197,6 +211,10 @@ mod ffi {
             interpolation: InterpolationOptions,
             filter: FilterOptions,
         ) -> Result<Box<Brdf>>;
+        fn saved_structure(filename: &str) -> Result<SavedStructure>;
+        fn load_inverse_bin_map(filename: &str, surface: Surface) -> Result<Box<Brdf>>;
+        /// Checks that the structure is that of a map.
+        fn load_inverse_bin_map_of(map: &Map, filename: &str, surface: Surface) -> Result<Box<Brdf>>;
         fn unfiltered(map: &Map, surface: Surface, bilinear: bool) -> Result<Box<Brdf>>;
         fn yan16(map: &Map, surface: Surface, options: Yan16Options) -> Result<Box<Brdf>>;
         fn evaluate(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> Evaluation;
@@ -266,10 +284,12 @@ impl Map {
 
 // ---- BRDFs ----------------------------------------------------------------------------------------------------------------------
 
-/// A method over a map, and how long it took to build.
+/// A method over a map, and how long it took to build or to load.
 pub struct Brdf {
     core: Core,
-    alpha: f32,
+    /// Columns and rows of the map; without it, those of the structure.
+    map: (u32, u32),
+    surface: ffi::Surface,
     build_seconds: f64,
     refinement: Option<Refinement>,
 }
@@ -315,6 +335,55 @@ fn inverse_bin_map(
         }
         let options = inverse_bin_map_options(options.bins, options.leaf_size);
         Ok(Box::new(InverseBinMap::new(&map, flakes(surface)?, options)?))
+    })
+}
+
+fn saved_structure(filename: &str) -> Result<ffi::SavedStructure> {
+    guarded("structure_file", filename, || {
+        let header = saved::header(Path::new(filename))?;
+        Ok(ffi::SavedStructure {
+            width: header.map.0,
+            height: header.map.1,
+            distribution: match header.distribution {
+                Distribution::Beckmann => ffi::FlakeDistribution::Beckmann,
+                Distribution::Ggx => ffi::FlakeDistribution::Ggx,
+            },
+            alpha: header.alpha,
+            projected: header.normalization == Normalization::Projected,
+        })
+    })
+}
+
+fn load_inverse_bin_map(filename: &str, surface: ffi::Surface) -> Result<Box<Brdf>> {
+    load(filename, surface, None)
+}
+
+fn load_inverse_bin_map_of(map: &Map, filename: &str, surface: ffi::Surface) -> Result<Box<Brdf>> {
+    load(filename, surface, Some(&map.0))
+}
+
+fn load(filename: &str, surface: ffi::Surface, map: Option<&NormalMap>) -> Result<Box<Brdf>> {
+    guarded("structure_file", filename, || {
+        let flakes = Flakes {
+            alpha: surface.alpha,
+            distribution: distribution(surface),
+            normalization: normalization(surface),
+        };
+        let start = Instant::now();
+        let saved = SavedMap::load(Path::new(filename), &flakes)?;
+        let refinement = match map {
+            Some(map) => saved.check_map(map)?,
+            None => None,
+        };
+        let size = map.map_or(saved.header().map, |map| (map.width(), map.height()));
+        let core = saved.into_brdf(masking(surface), map)?;
+        Ok(Box::new(Brdf {
+            core,
+            map: size,
+            surface,
+            build_seconds: start.elapsed().as_secs_f64(),
+            refinement,
+        }))
     })
 }
 
@@ -495,14 +564,7 @@ fn build(
     interpolation: ffi::InterpolationOptions,
     method: impl FnOnce(Cow<NormalMap>) -> Result<Box<dyn Method>>,
 ) -> Result<Box<Brdf>> {
-    let masking = match surface.masking {
-        ffi::MaskingKind::Beckmann => Masking::Beckmann,
-        ffi::MaskingKind::Explicit => Masking::Explicit {
-            alpha_u: surface.masking_alpha_u,
-            alpha_v: surface.masking_alpha_v,
-        },
-        _ => Masking::None,
-    };
+    let masking = masking(surface);
     guarded("filename", map.0.name(), || {
         let mut build_seconds = 0.0;
         let mut refinement = None;
@@ -514,14 +576,25 @@ fn build(
             build_seconds = start.elapsed().as_secs_f64();
             method
         })?;
-        let alpha = surface.alpha;
         Ok(Box::new(Brdf {
             core,
-            alpha,
+            map: (map.width(), map.height()),
+            surface,
             build_seconds,
             refinement,
         }))
     })
+}
+
+fn masking(surface: ffi::Surface) -> Masking {
+    match surface.masking {
+        ffi::MaskingKind::Beckmann => Masking::Beckmann,
+        ffi::MaskingKind::Explicit => Masking::Explicit {
+            alpha_u: surface.masking_alpha_u,
+            alpha_v: surface.masking_alpha_v,
+        },
+        _ => Masking::None,
+    }
 }
 
 impl Brdf {
@@ -567,7 +640,10 @@ impl Brdf {
         let method = self.core.method();
         ffi::Statistics {
             method: method.name().into(),
-            alpha: self.alpha,
+            width: self.map.0,
+            height: self.map.1,
+            alpha: self.surface.alpha,
+            distribution: self.surface.distribution,
             structure_bytes: method.structure_bytes() as u64,
             build_seconds: self.build_seconds,
             bins: method.bins().unwrap_or(0),
@@ -592,7 +668,7 @@ impl Brdf {
 /// A layer of flakes, and how long it took to build.
 pub struct FlakeLayer {
     core: flake_layer::FlakeLayer,
-    alpha: f32,
+    surface: ffi::Surface,
     build_seconds: f64,
 }
 
@@ -619,7 +695,7 @@ fn flake_layer(
         )?;
         Ok(Box::new(FlakeLayer {
             core,
-            alpha: surface.alpha,
+            surface,
             build_seconds: start.elapsed().as_secs_f64(),
         }))
     })
@@ -676,7 +752,10 @@ impl FlakeLayer {
         let method = self.core.method();
         ffi::Statistics {
             method: method.name().into(),
-            alpha: self.alpha,
+            width: method.map_size().0,
+            height: method.map_size().1,
+            alpha: self.surface.alpha,
+            distribution: self.surface.distribution,
             structure_bytes: self.core.structure_bytes() as u64,
             build_seconds: self.build_seconds,
             bins: method.bins().unwrap_or(0),

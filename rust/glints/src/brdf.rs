@@ -37,7 +37,8 @@ pub(crate) struct SmithMasking {
 }
 
 impl SmithMasking {
-    pub(crate) fn new(masking: Masking, map: &NormalMap) -> Result<Self> {
+    /// `slopes`: those of the map, asked for by [`Masking::Beckmann`] only.
+    pub(crate) fn new(masking: Masking, slopes: impl FnOnce() -> SlopeCovariance) -> Result<Self> {
         let squared = |name, alpha: f32| {
             if alpha.is_finite() && alpha >= 0.0 {
                 Ok(alpha * alpha)
@@ -51,7 +52,7 @@ impl SmithMasking {
                 xy: 0.0,
                 yy: 0.0,
             },
-            Masking::Beckmann => Self::of_slopes(map.slope_covariance()),
+            Masking::Beckmann => Self::of_slopes(slopes()),
             Masking::Explicit { alpha_u, alpha_v } => Self {
                 xx: squared("masking_alpha_u", alpha_u)?,
                 xy: 0.0,
@@ -108,8 +109,17 @@ impl Brdf {
         masking: Masking,
         method: impl FnOnce() -> Result<Box<dyn Method>>,
     ) -> Result<Self> {
+        Self::with_slopes(|| map.slope_covariance(), masking, method)
+    }
+
+    /// The same without the map; `slopes` is called for [`Masking::Beckmann`] only.
+    pub fn with_slopes(
+        slopes: impl FnOnce() -> SlopeCovariance,
+        masking: Masking,
+        method: impl FnOnce() -> Result<Box<dyn Method>>,
+    ) -> Result<Self> {
         Ok(Self {
-            masking: SmithMasking::new(masking, map)?,
+            masking: SmithMasking::new(masking, slopes)?,
             method: method()?,
         })
     }

@@ -85,7 +85,7 @@ impl FlakeLayer {
     ) -> Result<Self> {
         let Some(mask) = mask else {
             return Ok(Self {
-                masking: Masking::new(masking, map)?,
+                masking: Masking::new(masking, map.normals())?,
                 method: build(map)?,
                 mask: None,
             });
@@ -122,7 +122,7 @@ impl FlakeLayer {
             )?;
         }
         Ok(Self {
-            masking: Masking::of_normals(masking, &flakes)?,
+            masking: Masking::new(masking, &flakes)?,
             method,
             mask: Some(mask),
         })
@@ -193,7 +193,8 @@ impl FlakeLayer {
 }
 
 impl Masking {
-    fn new(masking: LayerMasking, map: &NormalMap) -> Result<Self> {
+    /// `flakes`: the normals whose slopes shadow.
+    fn new(masking: LayerMasking, flakes: &[Vec3]) -> Result<Self> {
         use crate::brdf::Masking as Smith;
         let smith = match masking {
             LayerMasking::Gtr(gtr) => return Ok(Self::Gtr(GtrMasking::new(&gtr))),
@@ -201,19 +202,9 @@ impl Masking {
             LayerMasking::Beckmann => Smith::Beckmann,
             LayerMasking::Explicit { alpha_u, alpha_v } => Smith::Explicit { alpha_u, alpha_v },
         };
-        Ok(Self::Smith(SmithMasking::new(smith, map)?))
-    }
-
-    /// The same from the normals of the flakes alone.
-    fn of_normals(masking: LayerMasking, flakes: &[Vec3]) -> Result<Self> {
-        match masking {
-            LayerMasking::Beckmann => Ok(Self::Smith(SmithMasking::of_slopes(slope_covariance(flakes)))),
-            // The others do not look at normals.
-            _ => Self::new(
-                masking,
-                &NormalMap::from_normals("one flake", 1, 1, &flakes[..1])?,
-            ),
-        }
+        Ok(Self::Smith(SmithMasking::new(smith, || {
+            slope_covariance(flakes)
+        })?))
     }
 
     #[inline]

@@ -25,3 +25,4 @@ pub mod microfacet;
 pub mod mip_map;
 pub mod normal_map;
 pub mod refinement;
+pub mod saved;
