@@ -1,13 +1,15 @@
 //! Parameters that several commands share.
 
 use std::borrow::Cow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use glints::flakes::{FlakeModel, Normalization};
+use glints::methods::compact::Header;
 use glints::microfacet::{self, Flake};
 use glints::normal_map::{self, NormalMap};
 use glints::refinement::{MAX_REFINEMENT, Refinement};
+use glints::saved::Flakes;
 use serde_json::{Value, json};
 
 use crate::failure::{self, Failure, Result};
@@ -39,6 +41,20 @@ enum Encoding {
 }
 
 impl MapArguments {
+    /// Refuses what says how a map is read, for a saved structure.
+    pub fn check_saved(&self) -> Result<()> {
+        let given = match (self.encoding, self.flip_y) {
+            (Encoding::Automatic, false) => return Ok(()),
+            (Encoding::Automatic, true) => "flip_y",
+            _ => "encoding",
+        };
+        Err(Failure::usage(format!(
+            "parameter \"{given}\": \"{}\" is a saved structure, which was made from the map as it was read then; leave \
+             the parameter out",
+            self.map.display()
+        )))
+    }
+
     /// Reads the map.
     pub fn load(&self) -> Result<NormalMap> {
         let _progress = Progress::spinner("reading the map");
@@ -54,13 +70,13 @@ impl MapArguments {
 /// The micro-BRDF of a flake.
 #[derive(Args)]
 pub struct FlakeArguments {
-    /// Roughness of a flake, in 0.0001 to 1: the artist's control between sharp glints and satin
-    #[arg(long, default_value_t = 0.01)]
-    pub alpha: f32,
+    /// Roughness of a flake, in 0.0001 to 1: the artist's control between sharp glints and satin [default: 0.01]
+    #[arg(long)]
+    pub alpha: Option<f32>,
 
-    /// Distribution of a flake's microfacets; `ggx` has a longer tail
-    #[arg(long, value_enum, default_value_t)]
-    pub distribution: Distribution,
+    /// Distribution of a flake's microfacets; `ggx` has a longer tail [default: beckmann]
+    #[arg(long, value_enum)]
+    pub distribution: Option<Distribution>,
 }
 
 /// See [`microfacet::Distribution`].
@@ -82,7 +98,21 @@ impl From<Distribution> for microfacet::Distribution {
 
 impl FlakeArguments {
     pub fn model(&self) -> Result<FlakeModel> {
-        model(self.distribution, self.alpha)
+        model(self.distribution.unwrap_or_default(), self.alpha.unwrap_or(0.01))
+    }
+
+    /// The flakes that a saved structure was made for, which must be those that are given.
+    pub fn of_saved(&self, path: &Path, header: &Header) -> Result<(Flakes, FlakeModel)> {
+        let found = Flakes::of(header);
+        let asked = Flakes {
+            alpha: self.alpha.unwrap_or(found.alpha),
+            distribution: self.distribution.map_or(found.distribution, Into::into),
+            ..found
+        };
+        asked.check(path, header)?;
+        let flake = Flake::new(found.distribution, found.alpha)?;
+        let normalization = found.normalization;
+        Ok((found, FlakeModel { flake, normalization }))
     }
 }
 
@@ -121,6 +151,18 @@ impl InterpolationArguments {
         Err(Failure::usage(format!(
             "parameter \"refinement\" = {}: {problem}",
             self.refinement
+        )))
+    }
+
+    /// Refuses all of this for a saved structure.
+    pub fn check_saved(&self, path: &Path) -> Result<()> {
+        if self.interpolation == Interpolation::Nearest {
+            return self.check();
+        }
+        Err(Failure::usage(format!(
+            "parameter \"interpolation\" = bilinear: \"{}\" is a saved structure, of an interpolated map if `precompute` \
+             was told so; leave the parameter out, or give the map",
+            path.display()
         )))
     }
 

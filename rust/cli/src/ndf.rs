@@ -8,9 +8,11 @@ use glints::flakes::FlakeModel;
 use glints::footprint::Footprint;
 use glints::footprint_filter::FootprintFilter;
 use glints::methods::Method;
+use glints::methods::compact::Header;
 use glints::methods::direct::Direct;
 use glints::methods::unfiltered::{Interpolation, Unfiltered};
 use glints::methods::yan16::{self, Elements, Yan16};
+use glints::microfacet;
 use glints::normal_map::NormalMap;
 use glints::refinement::Refinement;
 use serde_json::{Value, json};
@@ -36,6 +38,10 @@ use crate::structures;
 /// PNG pictures have colours on a logarithmic scale of five powers of ten that ends at the peak (the bar at the
 /// right has a notch at each); EXR pictures have the values. What is printed tells peak, mean and integral.
 ///
+/// In the place of the map, a structure that `precompute` saved can be given: its own distribution is shown, for its
+/// flakes, and the footprint is in its texels (of an interpolated map, the refined ones). There is no other method to
+/// compare it with: those need the map.
+///
 /// Example: glints ndf flakes.exr --at 0.3,0.6 --footprint 32 --method ibm --compare direct -o ndf.png
 #[derive(Args)]
 #[command(verbatim_doc_comment)]
@@ -52,9 +58,9 @@ pub struct Arguments {
     #[arg(long, value_name = "TEXELS", value_parser = parse_footprint, allow_hyphen_values = true)]
     footprint: [DVec2; 2],
 
-    /// How the footprint is filtered
-    #[arg(long, value_enum, default_value_t)]
-    method: MethodName,
+    /// How the footprint is filtered [default: direct; of a saved structure: ibm]
+    #[arg(long, value_enum)]
+    method: Option<MethodName>,
 
     #[command(flatten)]
     flake: FlakeArguments,
@@ -145,11 +151,10 @@ impl FilterArguments {
     }
 }
 
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 #[value(rename_all = "snake_case")]
 enum MethodName {
     /// The exact sum over the texels
-    #[default]
     Direct,
     /// Inverse bin map, in the structure of this project
     Ibm,
@@ -273,43 +278,37 @@ fn parse_footprint(text: &str) -> std::result::Result<[DVec2; 2], String> {
     }
 }
 
+/// What is shown: methods by name, the flakes they are for, and the size of the map in whose texels footprints are given.
+struct Shown {
+    methods: Vec<(MethodName, Box<dyn Method>)>,
+    model: FlakeModel,
+    size: (u32, u32),
+    refinement: Option<Refinement>,
+}
+
 pub fn run(arguments: &Arguments) -> Result<()> {
     let format = Format::of(&arguments.output)?;
-    let methods: Vec<MethodName> = std::iter::once(arguments.method)
-        .chain(arguments.compare)
-        .collect();
-    for method in &methods {
-        method.check(
-            arguments.flake.distribution,
-            arguments.interpolation.interpolation,
-        )?;
-    }
-    arguments.interpolation.check()?;
-    arguments.filter.check(&methods)?;
-    let destination = Destination::new(&arguments.output, arguments.force, &[&arguments.map.map])?;
-    let model = arguments.flake.model()?;
-    let map = arguments.map.load()?;
-    let refinement = arguments.interpolation.refinement(&map, model)?;
-    let method = arguments
-        .method
-        .build(&map, model, refinement, &arguments.filter)?;
-    let compare = match arguments.compare {
-        Some(name) => Some(name.build(&map, model, refinement, &arguments.filter)?),
-        None => None,
+    let destination = |input| Destination::new(&arguments.output, arguments.force, &[input]);
+    let destination = destination(arguments.map.map.as_path())?;
+    let shown = match structures::header(&arguments.map.map)? {
+        Some(header) => saved(arguments, &header)?,
+        None => built(arguments)?,
     };
-    let over = |method: &dyn Method| footprint(arguments, &map, method.map_size());
-    let asked = footprint(arguments, &map, (map.width(), map.height()));
+    let over = |method: &dyn Method| footprint(arguments, shown.size, method.map_size());
+    let with_footprint = |(_, method): &'_ (MethodName, Box<dyn Method>)| over(method.as_ref());
     let problem = Problem {
-        method: (method.as_ref(), over(method.as_ref())),
-        compare: compare.as_deref().map(|method| (method, over(method))),
-        lobe: f64::from(model.flake.alpha()) / std::f64::consts::SQRT_2,
+        method: (shown.methods[0].1.as_ref(), with_footprint(&shown.methods[0])),
+        compare: shown
+            .methods
+            .get(1)
+            .map(|other| (other.1.as_ref(), with_footprint(other))),
+        lobe: f64::from(shown.model.flake.alpha()) / std::f64::consts::SQRT_2,
         size: arguments.size,
         points: arguments.points,
     };
-    drop(map);
     let estimate = problem.solve();
     let peak = write(&destination, format, arguments.size, &estimate)?;
-    let report = report(arguments, &asked, refinement, &estimate, peak);
+    let report = report(arguments, &shown, &estimate, peak);
     output::print(&if arguments.json {
         format!("{report}\n")
     } else {
@@ -317,14 +316,74 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     })
 }
 
-/// The footprint over the map as resampled to `width` x `height` texels; its edges are given in the map's own.
-fn footprint(arguments: &Arguments, map: &NormalMap, (width, height): (u32, u32)) -> Footprint {
-    let size = DVec2::new(f64::from(width), f64::from(height));
-    let refinement = size / DVec2::new(f64::from(map.width()), f64::from(map.height()));
+/// Reads the map and builds the methods.
+fn built(arguments: &Arguments) -> Result<Shown> {
+    let names = [
+        Some(arguments.method.unwrap_or(MethodName::Direct)),
+        arguments.compare,
+    ];
+    let names: Vec<MethodName> = names.into_iter().flatten().collect();
+    for name in &names {
+        name.check(
+            arguments.flake.distribution.unwrap_or_default(),
+            arguments.interpolation.interpolation,
+        )?;
+    }
+    arguments.interpolation.check()?;
+    arguments.filter.check(&names)?;
+    let model = arguments.flake.model()?;
+    let map = arguments.map.load()?;
+    let refinement = arguments.interpolation.refinement(&map, model)?;
+    let build = |name: MethodName| {
+        let method = name.build(&map, model, refinement, &arguments.filter)?;
+        Ok((name, method))
+    };
+    Ok(Shown {
+        methods: names.into_iter().map(build).collect::<Result<_>>()?,
+        model,
+        size: (map.width(), map.height()),
+        refinement,
+    })
+}
+
+/// Loads a saved structure.
+fn saved(arguments: &Arguments, header: &Header) -> Result<Shown> {
+    let path = &arguments.map.map;
+    let needs_map = |parameter: &str, name: MethodName| {
+        Err(Failure::usage(format!(
+            "parameter \"{parameter}\" = {}: needs the normal map, and \"{}\" holds an inverse bin map alone; leave the \
+             parameter out, or give the map that it was made from",
+            name_of(name),
+            path.display()
+        )))
+    };
+    match (arguments.method, arguments.compare) {
+        (Some(name), _) if name != MethodName::Ibm => return needs_map("method", name),
+        (_, Some(name)) => return needs_map("compare", name),
+        _ => {}
+    }
+    arguments.filter.check(&[MethodName::Ibm])?;
+    arguments.map.check_saved()?;
+    arguments.interpolation.check_saved(path)?;
+    let (flakes, model) = arguments.flake.of_saved(path, header)?;
+    let _progress = Progress::spinner("loading the structure");
+    let structure = structures::load(path, &flakes)?;
+    Ok(Shown {
+        methods: vec![(MethodName::Ibm, Box::new(structure))],
+        model,
+        size: header.map,
+        refinement: None,
+    })
+}
+
+/// The footprint over the map as resampled to `size` texels; its edges are given in those of the map, of `map` texels.
+fn footprint(arguments: &Arguments, map: (u32, u32), size: (u32, u32)) -> Footprint {
+    let vector = |(x, y): (u32, u32)| DVec2::new(f64::from(x), f64::from(y));
+    let refinement = vector(size) / vector(map);
     // Whole periods go in double precision: they change nothing.
-    let center = DVec2::from(arguments.at.map(|x| x.rem_euclid(1.0))) * size;
+    let center = DVec2::from(arguments.at.map(|x| x.rem_euclid(1.0))) * vector(size);
     let [a, b] = arguments.footprint.map(|edge| edge * refinement);
-    Footprint::in_texels(width, height, center, a, b)
+    Footprint::in_texels(size.0, size.1, center, a, b)
 }
 
 /// The common peak of the scale.
@@ -342,16 +401,12 @@ fn write(destination: &Destination, format: Format, size: u32, estimate: &Estima
     Ok(peak)
 }
 
-fn report(
-    arguments: &Arguments,
-    footprint: &Footprint,
-    refinement: Option<Refinement>,
-    estimate: &Estimate,
-    peak: f32,
-) -> Value {
-    let pictures: Vec<Value> = [Some(arguments.method), arguments.compare]
-        .into_iter()
-        .flatten()
+fn report(arguments: &Arguments, shown: &Shown, estimate: &Estimate, peak: f32) -> Value {
+    let footprint = footprint(arguments, shown.size, shown.size);
+    let pictures: Vec<Value> = shown
+        .methods
+        .iter()
+        .map(|&(name, _)| name)
         .zip(&estimate.pictures)
         .map(|(name, picture)| {
             json!({
@@ -367,10 +422,13 @@ fn report(
         "output": arguments.output.display().to_string(),
         "center_texels": footprint.center().to_array(),
         "footprint_texels": footprint.edges().map(|edge| edge.to_array()),
-        "alpha": decimal(arguments.flake.alpha),
-        "distribution": name_of(arguments.flake.distribution),
+        "alpha": decimal(shown.model.flake.alpha()),
+        "distribution": match shown.model.flake.kind() {
+            microfacet::Distribution::Beckmann => "beckmann",
+            microfacet::Distribution::Ggx => "ggx",
+        },
         "footprint_filter": name_of(arguments.filter.footprint_filter),
-        "refinement": refinement_json(refinement),
+        "refinement": refinement_json(shown.refinement),
         "size": arguments.size,
         "scale": [peak / 10_f32.powf(DECADES), peak],
         "strategy": estimate.strategy,

@@ -21,8 +21,8 @@ pub enum Command {
 ///
 /// The file stands for the map, --interpolation, --alpha and --distribution: it is mapped into memory and used in place, without
 /// building anything. It is read by the version of this program that wrote it, and by all with the same file format.
-/// `glints info FILE` tells what it holds. The file appears when it is complete; nothing is left of an interrupted
-/// build.
+/// `glints info FILE` tells what it holds, `glints ndf FILE` shows it, and `structure_file` of the plugin glints_ibm loads it.
+/// The file appears when it is complete; nothing is left of an interrupted build.
 ///
 /// Example: glints precompute ibm flakes.exr --alpha 0.005 -o flakes.glints
 #[derive(Args)]

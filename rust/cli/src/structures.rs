@@ -7,6 +7,7 @@ use glints::methods::Method;
 use glints::methods::compact::{self, CompactBinMap, Header};
 use glints::methods::inverse_bin_map::{InverseBinMap, Options};
 use glints::normal_map::NormalMap;
+use glints::saved::{Flakes, SavedMap};
 
 use crate::failure::Result;
 
@@ -26,6 +27,11 @@ pub fn ibm_paper(map: &NormalMap, model: FlakeModel) -> Result<Box<dyn Method>> 
 /// Writes a structure to a file.
 pub fn save(structure: &Structure, path: &Path) -> Result<()> {
     Ok(structure.save(path)?)
+}
+
+/// Loads a structure that was made for these flakes.
+pub fn load(path: &Path, flakes: &Flakes) -> Result<Structure> {
+    Ok(SavedMap::load(path, flakes)?.into_structure())
 }
 
 /// The header of a saved structure; `None` for any other file.

@@ -325,6 +325,58 @@ fn gaussian_footprints_are_those_of_mixtures() {
 }
 
 #[test]
+fn a_saved_structure_is_shown_as_the_one_that_is_built() {
+    let folder = folder_with_map();
+    let flakes = ["--alpha", "0.05", "--distribution", "ggx"];
+    let precompute = ["precompute", "ibm", "flakes.exr", "-o", "flakes.glints"];
+    succeeds(folder.path(), &[&precompute[..], &flakes].concat());
+    let options = ["--footprint", "20", "--size", "64", "--force", "--json"];
+    let show = |input: &str, output: &str, more: &[&str]| {
+        let arguments = [&["ndf", input, "-o", output], &options[..], more].concat();
+        let report = json(folder.path(), &arguments);
+        assert_eq!(report["pictures"][0]["method"], "ibm");
+        (report, std::fs::read(folder.path().join(output)).unwrap())
+    };
+    let (built, expected) = show(
+        "flakes.exr",
+        "a.exr",
+        &[&["--method", "ibm"], &flakes[..]].concat(),
+    );
+    let (loaded, found) = show("flakes.glints", "b.exr", &[]);
+    assert!(found == expected);
+    assert_eq!(loaded["pictures"], built["pictures"]);
+    assert_eq!(loaded["alpha"], 0.05);
+    assert_eq!(loaded["distribution"], "ggx");
+    // What agrees may be said; the twin are other flakes.
+    assert!(
+        show(
+            "flakes.glints",
+            "b.exr",
+            &[&["--method", "ibm"], &flakes[..]].concat()
+        )
+        .1 == expected
+    );
+    assert!(show("flakes.exr", "c.exr", &["--method", "ibm"]).1 != expected);
+
+    let refused = |more: &[&str], words: &[&str]| {
+        let arguments = [&["ndf", "flakes.glints", "-o", "d.exr"], &options[..], more].concat();
+        fails(
+            folder.path(),
+            &arguments,
+            2,
+            &[&["flakes.glints"], words].concat(),
+        );
+    };
+    refused(&["--method", "direct"], &["\"method\"", "needs the normal map"]);
+    refused(&["--compare", "direct"], &["\"compare\"", "needs the normal map"]);
+    refused(&["--alpha", "0.04"], &["\"alpha\"", "0.05", "--alpha 0.04"]);
+    refused(&["--distribution", "beckmann"], &["\"distribution\"", "ggx"]);
+    refused(&["--interpolation", "bilinear"], &["\"interpolation\"", "leave"]);
+    refused(&["--flip-y"], &["\"flip_y\"", "leave"]);
+    assert!(!folder.path().join("d.exr").exists());
+}
+
+#[test]
 fn interpolated_maps_are_the_surface_of_curved_elements() {
     let folder = tempfile::tempdir().unwrap();
     let up = |i: u32| 0.5 + 0.1 * (f64::from(i) * std::f64::consts::TAU / 16.0).sin();
