@@ -1,11 +1,12 @@
 """Runs the C++ API and the plugins under valgrind's memory checker.
 
-    scripts/memcheck            # everything, some minutes
+    scripts/memcheck            # everything, three minutes
     scripts/memcheck --quick    # the C++ API alone, and the planted errors
 
-A report counts if a frame of its stack is in this project's libraries or programs: reads and writes out of bounds or of
-freed memory, decisions on bytes that were never written, and memory that nobody can free any more. What Python, Mitsuba and
-the C library do among themselves does not. That errors are found is proved in the same run, by a program with planted ones.
+A report counts if a frame of its stack is in this project's libraries or programs: reads and writes out of bounds or
+of freed memory, decisions on bytes that were never written, and memory that nobody can free any more. What Python,
+Mitsuba and the C library do among themselves does not. That errors are found is proved in the same run, by a program
+with planted ones.
 
 Needs valgrind (apt-get install valgrind); says so where it is missing.
 """
