@@ -247,3 +247,94 @@ fn named(error: Error) -> Error {
         other => other,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flakes::FlakeModel;
+    use approx::assert_relative_eq;
+    use glam::Vec3;
+
+    const FLAKES: Flakes = Flakes {
+        alpha: 0.02,
+        distribution: Distribution::Beckmann,
+        normalization: Normalization::Projected,
+    };
+
+    fn wavy_map() -> NormalMap {
+        let normals: Vec<Vec3> = (0..48 * 32)
+            .map(|i| Vec3::new((i as f32).sin() * 0.3, (i as f32 * 1.7).cos() * 0.2, 1.0))
+            .collect();
+        NormalMap::from_normals("wavy", 48, 32, &normals).unwrap()
+    }
+
+    /// The structure of a map, saved and loaded; the file is gone afterwards.
+    fn saved(map: &NormalMap) -> SavedMap {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.glints");
+        let model = FlakeModel {
+            flake: Flake::new(FLAKES.distribution, FLAKES.alpha).unwrap(),
+            normalization: FLAKES.normalization,
+        };
+        CompactBinMap::new(map, model).save(&path).unwrap();
+        let other = Flakes {
+            alpha: 0.03,
+            ..FLAKES
+        };
+        let refused = SavedMap::load(&path, &other).err().unwrap().to_string();
+        assert!(
+            refused.contains("\"alpha\" = 0.03") && refused.contains("0.02"),
+            "{refused}"
+        );
+        SavedMap::load(&path, &FLAKES).unwrap()
+    }
+
+    #[test]
+    fn slopes_of_the_file_are_those_of_the_map() {
+        let map = wavy_map();
+        let (found, expected) = (saved(&map).slope_covariance(), map.slope_covariance());
+        assert_relative_eq!(found.xx, expected.xx, max_relative = 1e-3);
+        assert_relative_eq!(found.yy, expected.yy, max_relative = 1e-3);
+        assert!((found.xy - expected.xy).abs() < 1e-3 * expected.xx);
+    }
+
+    #[test]
+    fn masking_is_that_of_the_map_where_there_is_one() {
+        let map = wavy_map();
+        let built = Brdf::with_slopes(
+            || map.slope_covariance(),
+            Masking::Beckmann,
+            || Ok(Box::new(saved(&map).into_structure())),
+        );
+        let alphas = |map| {
+            saved(&wavy_map())
+                .into_brdf(Masking::Beckmann, map)
+                .unwrap()
+                .masking_alphas()
+        };
+        assert_eq!(alphas(Some(&map)), built.unwrap().masking_alphas());
+        assert!(alphas(None) != alphas(Some(&map)));
+        let none = saved(&map).into_brdf(Masking::None, None).unwrap();
+        assert_eq!(none.masking_alphas(), (0.0, 0.0));
+        assert_eq!(none.method().map_size(), (48, 32));
+    }
+
+    #[test]
+    fn only_the_map_of_the_file_passes() {
+        let map = wavy_map();
+        assert_eq!(saved(&map).check_map(&map).unwrap(), None);
+        let refined = saved(&map.refined(3).unwrap());
+        assert_eq!(refined.check_map(&map).unwrap().unwrap().refinement, 3);
+        let mut normals = map.normals().to_vec();
+        normals[48 * 20 + 5] = Vec3::new(0.3, -0.3, 1.0);
+        let other = NormalMap::from_normals("other", 48, 32, &normals).unwrap();
+        let refused = saved(&map).check_map(&other).unwrap_err().to_string();
+        assert!(refused.contains("column 5, row 20"), "{refused}");
+        let turned = NormalMap::from_normals("turned", 32, 48, map.normals()).unwrap();
+        let refused = saved(&map).check_map(&turned).unwrap_err().to_string();
+        assert!(
+            refused.contains("32 x 48") && refused.contains("48 x 32"),
+            "{refused}"
+        );
+    }
+}
