@@ -6,7 +6,7 @@ pub mod inverse_bin_map;
 pub mod unfiltered;
 pub mod yan16;
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
@@ -34,6 +34,21 @@ pub trait Method: Send + Sync {
 
     /// The filtered distribution of normals `D_A(h)`, per solid angle: `R` without shadowing.
     fn ndf(&self, footprint: &Footprint, h: Vec3) -> f32;
+
+    /// The mean of [`Method::ndf`] over the rectangle `[low, high]` of the projected disk (half vectors' x and
+    /// y), the range query of Deng et al. 2022 (Eq. 7):
+    ///
+    /// ```text
+    /// 1 / |[low, high]|  integral over [low, high] of  D_A(x, y, sqrt(1 - x^2 - y^2)) dx dy,
+    /// ```
+    ///
+    /// an area mean of a density per solid angle. Outside the unit disk `D_A` counts as zero and the area still
+    /// counts, so that rectangles are additive: `area * mean` of a union of disjoint ones is the sum of theirs.
+    /// A rectangle without area (`low < high` does not hold in both components) answers zero. `None`: the method
+    /// cannot, whatever the rectangle.
+    fn ndf_over(&self, _footprint: &Footprint, _low: Vec2, _high: Vec2) -> Option<f32> {
+        None
+    }
 
     /// Draws a half vector: `u[0..2]` choose the point of the footprint, `u[2..4]` the normal of the flake
     /// there. `None`: the draw failed and counts as zero.
