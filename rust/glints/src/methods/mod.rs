@@ -3,6 +3,7 @@
 pub mod compact;
 pub mod direct;
 pub mod inverse_bin_map;
+pub mod tensor;
 pub mod unfiltered;
 pub mod yan16;
 

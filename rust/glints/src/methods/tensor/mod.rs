@@ -1,0 +1,3 @@
+//! Tensor-decomposed distributions of normals.
+
+pub mod cp;
