@@ -128,6 +128,14 @@ impl Footprint {
         Self::new(width, height, scale(center), scale(a), scale(b))
     }
 
+    /// The footprint with the same centre and edges of `factor` times the length.
+    pub fn widened(&self, factor: f64) -> Self {
+        let region = self
+            .region
+            .and_then(|r| Parallelogram::spanned(self.center, r.edges[0] * factor, r.edges[1] * factor));
+        Self { region, ..*self }
+    }
+
     /// Columns and rows of the map.
     pub fn map_size(&self) -> DVec2 {
         self.size

@@ -9,7 +9,9 @@
 //! corner of texel (0, 0)); unit vectors in the local shading frame, z the shading normal; densities per
 //! solid angle.
 
+mod array;
 pub mod brdf;
+mod container;
 pub mod error;
 pub mod flake_layer;
 pub mod flake_map;

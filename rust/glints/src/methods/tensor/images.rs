@@ -1,0 +1,714 @@
+//! Compressed images: storage, point queries, range queries and sampling (Deng et al. 2022, Sections 4.2 to 4.4 and 5.2).
+//!
+//! **Statement** An image is cut into blocks of 16 x 16 pixels, the map into 8 x 8 regions. The blocks of one direction of all
+//! images of one region, over all levels, are a *group*, a tensor of 16 x 16 x L values; blank blocks are left out. Its
+//! decomposition of rank R gives the pixel (i, j) of the block with row z as
+//!
+//! ```text
+//! c(i, j, z) = sum_r C_r Y_r(i) X_r(j) Z_r(z)                                              (Eq. 6)
+//! ```
+//!
+//! **Layout** of a group, 16-bit integers: prefix sums `S_r(i) = Y_r(0) + ... + Y_r(i)` for 16 rows, the same for 16 columns, then
+//! L rows of Z, every row with its R components side by side. The prefix sums are the summed-area tables of the published method,
+//! and its vectors, too: `Y_r(i) = S_r(i) - S_r(i - 1)`. With 12 bits for Y, a sum of sixteen never overflows, so that point
+//! and range queries read the same exact numbers and the tables cost nothing. `C_r` holds all scales, in single precision.
+//! Which images have a row is a set of bits for each group; the row is the number of bits before the image's.
+//!
+//! **Values** A sum of rank R dips below zero. Every pixel counts as `max(c, 0)`, before anything is blended, and every image
+//! is divided by the exact sum of what counts, its *total*. A distribution is a blend of images, hence integrates to one whatever the
+//! rank; a sample comes from one image, chosen by its share, a block of it, a pixel of the block and a point of the pixel's
+//! tent, all from exactly the density that [`Images::density`] answers.
+//!
+//! **Sampling** Published is a descent through quads with range queries, whose answers can be negative. Here the shares of an
+//! image's blocks are stored, 16 bits each; they are rounded up, and the rounding is undone by rejecting a block with the
+//! excess as probability (below 1e-3 for all of an image's blocks together). The block is then reconstructed, 256 R multiplications,
+//! and a pixel drawn from its exact values.
+
+use std::ops::Range;
+
+use arrayvec::ArrayVec;
+use glam::Vec2;
+use wide::{f32x8, i16x8, i32x8};
+
+use super::pyramid::Geometry;
+use super::{BLOCK, PIXELS, REGIONS};
+use crate::array::Array;
+use crate::hash::mix;
+
+/// Largest rank.
+pub const MAX_RANK: usize = 64;
+
+/// Largest magnitude of a quantised Y or X: sixteen of them sum up to 16 bits.
+pub const LARGEST_FACTOR: f32 = 2047.0;
+
+/// Largest magnitude of a quantised Z.
+pub const LARGEST_ROW: f32 = 32_767.0;
+
+/// Elements after the last one of an array that is read eight at a time.
+pub const PADDING: usize = 8;
+
+/// Vectors of eight components.
+const CHUNKS: usize = MAX_RANK / 8;
+
+/// Elements of a group of a rank with so many rows.
+pub fn elements(rank: usize, rows: usize) -> usize {
+    (2 * BLOCK + rows) * rank
+}
+
+/// Share of an image that has the mass 65535.
+const WHOLE: f32 = 65_535.0;
+
+/// Draws of a block before sampling gives up: each is rejected with a probability of at most 1e-2.
+const MOST_DRAWS: u64 = 8;
+
+/// Images with their weights.
+pub type Blend = ArrayVec<(u32, f32), 32>;
+
+/// Where the parts of a group are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Group {
+    /// First element in [`Parts::factors`].
+    pub factors: u32,
+    /// First element in [`Parts::scales`].
+    pub scales: u32,
+    pub block: u16,
+    pub region: u8,
+    pub rank: u8,
+}
+
+impl Group {
+    /// As a file holds it.
+    pub fn packed(&self) -> [u32; 3] {
+        let rest = u32::from(self.block) | u32::from(self.region) << 16 | u32::from(self.rank) << 24;
+        [self.factors, self.scales, rest]
+    }
+
+    pub fn unpacked([factors, scales, rest]: [u32; 3]) -> Self {
+        Self {
+            factors,
+            scales,
+            block: rest as u16,
+            region: (rest >> 16) as u8,
+            rank: (rest >> 24) as u8,
+        }
+    }
+}
+
+/// What a file holds.
+#[derive(Default)]
+pub struct Parts {
+    /// [`Group`]s in the order of regions, then blocks.
+    pub groups: Array<[u32; 3]>,
+    /// Bits of the images of the region that have a row: [`Members::words`] words a group.
+    pub masks: Array<u64>,
+    /// Prefix sums and rows, with padding.
+    pub factors: Array<i16>,
+    /// `C_r`, with padding.
+    pub scales: Array<f32>,
+    /// Shares of each image's blocks, image by image, blocks in order.
+    pub masses: Array<u16>,
+    /// Sum of what counts of each image, in densities: times the area of a pixel, its energy.
+    pub totals: Array<f32>,
+}
+
+impl Parts {
+    pub fn bytes(&self) -> usize {
+        self.groups.bytes()
+            + self.masks.bytes()
+            + self.factors.bytes()
+            + self.scales.bytes()
+            + self.masses.bytes()
+            + self.totals.bytes()
+    }
+}
+
+/// Which images belong to which region.
+pub struct Members {
+    /// Of each image.
+    pub region: Vec<u8>,
+    /// Number of each image among those of its region.
+    pub local: Vec<u16>,
+    /// Images of each region, in order.
+    pub images: Vec<Vec<u32>>,
+    /// Words of a group's mask.
+    pub words: usize,
+}
+
+impl Members {
+    pub fn new(geometry: &Geometry) -> Self {
+        let region = geometry.regions();
+        let mut images = vec![Vec::new(); (REGIONS * REGIONS) as usize];
+        let mut local = Vec::with_capacity(region.len());
+        for (image, &r) in region.iter().enumerate() {
+            local.push(images[r as usize].len() as u16);
+            images[r as usize].push(image as u32);
+        }
+        let most = images.iter().map(Vec::len).max().unwrap_or(0);
+        Self {
+            region,
+            local,
+            images,
+            words: most.div_ceil(64),
+        }
+    }
+}
+
+/// See the module.
+pub struct Images {
+    pub geometry: Geometry,
+    members: Members,
+    parts: Parts,
+    groups: Vec<Group>,
+    /// Group of each region and block plus one, or zero.
+    lookup: Vec<u32>,
+    /// First mass of each image, and the end.
+    starts: Vec<u32>,
+    /// `1 / total` of each image, zero for one without energy.
+    inv_totals: Vec<f32>,
+}
+
+/// Products of rows, columns and scales of one group for a few pixels.
+struct Products<const N: usize> {
+    values: [[f32x8; CHUNKS]; N],
+    chunks: usize,
+}
+
+/// A block's part of a query: pixels with their weights.
+type Corner = (u32, ArrayVec<(usize, usize, f32), 4>);
+
+/// Along one axis, which pixels of a block count how much: all of a range once, some by their weights.
+#[derive(Clone, Debug, Default)]
+struct Interval {
+    whole: Range<usize>,
+    parts: ArrayVec<(usize, f32), 6>,
+}
+
+impl Images {
+    /// Parts that fit together: see [`super::check`].
+    pub fn new(geometry: Geometry, parts: Parts) -> Self {
+        let members = Members::new(&geometry);
+        let blocks = geometry.blocks().pow(2) as usize;
+        let groups: Vec<Group> = parts
+            .groups
+            .iter()
+            .map(|&packed| Group::unpacked(packed))
+            .collect();
+        let mut lookup = vec![0; (REGIONS * REGIONS) as usize * blocks];
+        let mut counts = vec![0_u32; geometry.images as usize + 1];
+        for (index, group) in groups.iter().enumerate() {
+            lookup[group.region as usize * blocks + group.block as usize] = index as u32 + 1;
+            let mask = &parts.masks[index * members.words..][..members.words];
+            for (local, &image) in members.images[group.region as usize].iter().enumerate() {
+                counts[image as usize + 1] += u32::from(has(mask, local));
+            }
+        }
+        let starts = counts
+            .iter()
+            .scan(0, |sum, &count| {
+                *sum += count;
+                Some(*sum)
+            })
+            .collect();
+        let inv_totals = parts
+            .totals
+            .iter()
+            .map(|&total| if total > 0.0 { 1.0 / total } else { 0.0 })
+            .collect();
+        Self {
+            geometry,
+            members,
+            parts,
+            groups,
+            lookup,
+            starts,
+            inv_totals,
+        }
+    }
+
+    pub fn parts(&self) -> &Parts {
+        &self.parts
+    }
+
+    pub fn groups(&self) -> &[Group] {
+        &self.groups
+    }
+
+    /// The row of an image in a group, if it has one.
+    pub fn row_of(&self, group: usize, image: u32) -> Option<usize> {
+        let local = self.members.local[image as usize] as usize;
+        let same = self.members.region[image as usize] == self.groups[group].region;
+        (same && has(self.mask(group), local)).then(|| rank_of(self.mask(group), local))
+    }
+
+    /// Bytes that queries need.
+    pub fn bytes(&self) -> usize {
+        let members = &self.members;
+        self.parts.bytes()
+            + size_of_val(&self.groups[..])
+            + size_of_val(&self.lookup[..])
+            + size_of_val(&self.starts[..])
+            + size_of_val(&self.inv_totals[..])
+            + size_of_val(&members.region[..])
+            + size_of_val(&members.local[..])
+            + 4 * members.region.len()
+    }
+
+    /// Ranks of all groups.
+    pub fn ranks(&self) -> impl Iterator<Item = usize> + '_ {
+        self.groups.iter().map(|group| group.rank as usize)
+    }
+
+    // ---- point queries --------------------------------------------------------------------------------------------------------
+
+    /// The blend's density per projected area at a point of the disk.
+    pub fn density(&self, blend: &Blend, p: Vec2) -> f32 {
+        self.blended(blend, p, |value| value.max(0.0))
+    }
+
+    /// The same without clamping: what range queries average.
+    pub fn raw_density(&self, blend: &Blend, p: Vec2) -> f32 {
+        self.blended(blend, p, |value| value)
+    }
+
+    #[inline(always)]
+    fn blended(&self, blend: &Blend, p: Vec2, counts: impl Fn(f32) -> f32) -> f32 {
+        let mut sum = 0.0;
+        for (block, pixels) in self.corners(p) {
+            let mut known = None;
+            for &(image, weight) in blend {
+                let Some((index, row)) = self.find(image, block) else {
+                    continue;
+                };
+                let group = &self.groups[index];
+                if known.as_ref().is_none_or(|(i, _)| *i != index) {
+                    known = Some((index, self.products(group, &pixels)));
+                }
+                let Some((_, products)) = &known else { continue };
+                let z = self.row(group, row);
+                let mut value = 0.0;
+                for (k, (_, _, tent)) in pixels.iter().enumerate() {
+                    value += tent * counts(products.dot(k, &z));
+                }
+                sum += weight * self.inv_totals[image as usize] * value;
+            }
+        }
+        sum * self.densities()
+    }
+
+    /// The density of one image at a pixel as reconstructed, negative values included, not normalised.
+    pub fn raw(&self, image: u32, column: u32, row: u32) -> f32 {
+        let side = BLOCK as u32;
+        let block = row / side * self.geometry.blocks() + column / side;
+        self.find(image, block).map_or(0.0, |(index, z)| {
+            let group = &self.groups[index];
+            let pixel = [((row % side) as usize, (column % side) as usize, 1.0)];
+            self.products(group, &pixel.into_iter().collect())
+                .dot(0, &self.row(group, z))
+        })
+    }
+
+    /// From shares of an image to densities: one over the area of a pixel.
+    fn densities(&self) -> f32 {
+        let pixel = self.geometry.pixel();
+        1.0 / (pixel * pixel)
+    }
+
+    /// The four pixels around a point with their weights, block by block.
+    fn corners(&self, p: Vec2) -> ArrayVec<Corner, 4> {
+        let u = (p + 1.0) / self.geometry.pixel() - 0.5;
+        let first = u.floor();
+        let f = u - first;
+        let mut corners: ArrayVec<Corner, 4> = ArrayVec::new();
+        for (dy, wy) in [(0, 1.0 - f.y), (1, f.y)] {
+            for (dx, wx) in [(0, 1.0 - f.x), (1, f.x)] {
+                let (column, row) = (first.x as i32 + dx, first.y as i32 + dy);
+                let inside = 0..self.geometry.resolution as i32;
+                if !inside.contains(&column) || !inside.contains(&row) || wx * wy <= 0.0 {
+                    continue;
+                }
+                let (column, row) = (column as usize, row as usize);
+                let block = row / BLOCK * self.geometry.blocks() as usize + column / BLOCK;
+                let pixel = (row % BLOCK, column % BLOCK, wx * wy);
+                match corners.iter_mut().find(|(b, _)| *b == block as u32) {
+                    Some((_, pixels)) => pixels.push(pixel),
+                    None => corners.push((block as u32, std::iter::once(pixel).collect())),
+                }
+            }
+        }
+        corners
+    }
+
+    /// The group of an image's block and the block's row in it.
+    #[inline]
+    fn find(&self, image: u32, block: u32) -> Option<(usize, usize)> {
+        let region = self.members.region[image as usize] as usize;
+        let blocks = self.geometry.blocks().pow(2) as usize;
+        let index = self.lookup[region * blocks + block as usize].checked_sub(1)? as usize;
+        let local = self.members.local[image as usize] as usize;
+        let mask = self.mask(index);
+        has(mask, local).then(|| (index, rank_of(mask, local)))
+    }
+
+    #[inline]
+    fn mask(&self, group: usize) -> &[u64] {
+        &self.parts.masks[group * self.members.words..][..self.members.words]
+    }
+
+    /// `C_r Y_r(i) X_r(j)` for pixels (i, j).
+    #[inline]
+    fn products(&self, group: &Group, pixels: &ArrayVec<(usize, usize, f32), 4>) -> Products<4> {
+        let rank = group.rank as usize;
+        let mut products = Products {
+            values: [[f32x8::ZERO; CHUNKS]; 4],
+            chunks: rank.div_ceil(8),
+        };
+        for chunk in 0..products.chunks {
+            let scale = self.scale(group, chunk);
+            for (k, &(row, column, _)) in pixels.iter().enumerate() {
+                let y = self.factor(group, 0, row, chunk);
+                let x = self.factor(group, 1, column, chunk);
+                products.values[k][chunk] = scale * y * x;
+            }
+        }
+        products
+    }
+
+    /// Eight of `C_r`; beyond the rank zero, so that no other factor has to end there.
+    #[inline]
+    fn scale(&self, group: &Group, chunk: usize) -> f32x8 {
+        let first = group.scales as usize + 8 * chunk;
+        let mut scale: [f32; 8] = self.parts.scales[first..first + 8].try_into().unwrap_or_default();
+        let rest = (group.rank as usize).saturating_sub(8 * chunk);
+        if rest < 8 {
+            scale[rest..].fill(0.0);
+        }
+        f32x8::from(scale)
+    }
+
+    /// Eight components of `Y(i)` (axis 0) or `X(i)` (axis 1).
+    #[inline]
+    fn factor(&self, group: &Group, axis: usize, i: usize, chunk: usize) -> f32x8 {
+        self.prefix(group, axis, i + 1, chunk) - self.prefix(group, axis, i, chunk)
+    }
+
+    /// Eight components of the sum of the first `i` of `Y` or `X`.
+    #[inline]
+    fn prefix(&self, group: &Group, axis: usize, i: usize, chunk: usize) -> f32x8 {
+        match i {
+            0 => f32x8::ZERO,
+            i => self.eight(group, axis * BLOCK + i - 1, chunk),
+        }
+    }
+
+    #[inline]
+    fn eight(&self, group: &Group, line: usize, chunk: usize) -> f32x8 {
+        let first = group.factors as usize + line * group.rank as usize + 8 * chunk;
+        let values: [i16; 8] = self.parts.factors[first..first + 8]
+            .try_into()
+            .unwrap_or_default();
+        f32x8::from_i32x8(i32x8::from_i16x8(i16x8::from(values)))
+    }
+
+    /// A row of Z.
+    #[inline]
+    fn row(&self, group: &Group, row: usize) -> [f32x8; CHUNKS] {
+        let mut z = [f32x8::ZERO; CHUNKS];
+        for (chunk, z) in z.iter_mut().enumerate().take((group.rank as usize).div_ceil(8)) {
+            *z = self.eight(group, 2 * BLOCK + row, chunk);
+        }
+        z
+    }
+
+    // ---- range queries --------------------------------------------------------------------------------------------------------
+
+    /// The blend's mean density over the rectangle `[low, high]` (Eq. 7): exactly the mean of what the pixels' tents
+    /// give at its points before negative values are clamped, whatever the number of blocks it overlaps; zero if that is negative.
+    pub fn mean(&self, blend: &Blend, low: Vec2, high: Vec2) -> f32 {
+        self.raw_mean(blend, low, high).max(0.0)
+    }
+
+    /// The same, negative as it may be.
+    pub fn raw_mean(&self, blend: &Blend, low: Vec2, high: Vec2) -> f32 {
+        if !low.cmplt(high).all() {
+            return 0.0;
+        }
+        let pixels = |p: Vec2| (p.as_dvec2() + 1.0) / f64::from(self.geometry.pixel()) - 0.5;
+        let (a, b) = (pixels(low), pixels(high));
+        let columns = self.intervals(a.x, b.x);
+        let rows = self.intervals(a.y, b.y);
+        let mut sum = 0.0;
+        for (block_row, row) in &rows {
+            for (block_column, column) in &columns {
+                let block = block_row * self.geometry.blocks() + block_column;
+                sum += self.sum_block(blend, block, row, column);
+            }
+        }
+        let area = (b - a).x * (b - a).y;
+        (sum / area) as f32 * self.densities()
+    }
+
+    fn sum_block(&self, blend: &Blend, block: u32, rows: &Interval, columns: &Interval) -> f64 {
+        let mut sum = 0.0;
+        let mut known: Option<(usize, Products<1>)> = None;
+        for &(image, weight) in blend {
+            let Some((index, row)) = self.find(image, block) else {
+                continue;
+            };
+            let group = &self.groups[index];
+            if known.as_ref().is_none_or(|(i, _)| *i != index) {
+                let mut products = Products {
+                    values: [[f32x8::ZERO; CHUNKS]],
+                    chunks: (group.rank as usize).div_ceil(8),
+                };
+                for chunk in 0..products.chunks {
+                    products.values[0][chunk] = self.scale(group, chunk)
+                        * self.sum(group, 0, rows, chunk)
+                        * self.sum(group, 1, columns, chunk);
+                }
+                known = Some((index, products));
+            }
+            if let Some((_, products)) = &known {
+                let share = products.dot(0, &self.row(group, row)) * self.inv_totals[image as usize];
+                sum += f64::from(weight * share);
+            }
+        }
+        sum
+    }
+
+    /// Eight components of the weighted sum of `Y` or `X` over an interval: two look-ups, and what is cut at the ends.
+    #[inline]
+    fn sum(&self, group: &Group, axis: usize, interval: &Interval, chunk: usize) -> f32x8 {
+        let Range { start, end } = interval.whole;
+        let mut sum = self.prefix(group, axis, end, chunk) - self.prefix(group, axis, start, chunk);
+        for &(i, weight) in &interval.parts {
+            sum += self.factor(group, axis, i, chunk) * f32x8::splat(weight);
+        }
+        sum
+    }
+
+    /// The blocks that an interval of pixel coordinates meets (0 at the centre of the first pixel), with what counts of each.
+    fn intervals(&self, a: f64, b: f64) -> Vec<(u32, Interval)> {
+        let last = f64::from(self.geometry.resolution) - 1.0;
+        // Tents reach one pixel beyond their centres.
+        let first = (a - 1.0).floor().clamp(0.0, last) as usize;
+        let end = ((b + 1.0).ceil().clamp(-1.0, last) + 1.0) as usize;
+        let mut intervals = Vec::new();
+        for block in first / BLOCK..end.div_ceil(BLOCK) {
+            let pixels = first.max(block * BLOCK)..end.min((block + 1) * BLOCK);
+            intervals.push((block as u32, Interval::new(a, b, pixels, block * BLOCK)));
+        }
+        intervals
+    }
+
+    // ---- sampling -------------------------------------------------------------------------------------------------------------
+
+    /// A point of the disk's square from the density of one image. `u` choose a block; a row and the place in it; a column and
+    /// the place in it. `None`: the image has no energy.
+    pub fn sample(&self, image: u32, u: [f32; 3]) -> Option<Vec2> {
+        let groups = self.groups_of(self.members.region[image as usize]);
+        let masses = &self.parts.masses
+            [self.starts[image as usize] as usize..self.starts[image as usize + 1] as usize];
+        let all: u32 = masses.iter().map(|&m| u32::from(m)).sum();
+        let unit = self.parts.totals[image as usize] / WHOLE;
+        let mut pixels = [0.0; PIXELS];
+        let mut uniform = u[0];
+        for draw in 1..=MOST_DRAWS {
+            let mut left = ((uniform * all as f32) as u32).min(all.checked_sub(1)?);
+            let local = self.members.local[image as usize] as usize;
+            let present = groups.clone().filter(|&g| has(self.mask(g), local));
+            let mut chosen = None;
+            for (index, &mass) in present.zip(masses) {
+                if left < u32::from(mass) {
+                    chosen = Some((index, mass));
+                    break;
+                }
+                left -= u32::from(mass);
+            }
+            let (index, mass) = chosen?;
+            let group = &self.groups[index];
+            self.reconstruct(group, rank_of(self.mask(index), local), &mut pixels);
+            let sum: f32 = pixels.iter().sum();
+            let z = mix(u64::from(u[1].to_bits()) << 32 | u64::from(u[2].to_bits()) ^ (draw << 16));
+            let random = |bits: u64| (bits & 0xff_ffff) as f32 / 16_777_216.0;
+            if random(z) * f32::from(mass) * unit < sum {
+                return Some(self.point(u32::from(group.block), &pixels, u[1], u[2]));
+            }
+            uniform = random(z >> 32);
+        }
+        None
+    }
+
+    /// A pixel of a block by its value, and a point of its tent.
+    fn point(&self, block: u32, pixels: &[f32; PIXELS], u: f32, v: f32) -> Vec2 {
+        let rows: [f32; BLOCK] = std::array::from_fn(|i| pixels[i * BLOCK..][..BLOCK].iter().sum());
+        let (row, u) = choose(&rows, u);
+        let (column, v) = choose(&pixels[row * BLOCK..][..BLOCK], v);
+        let place = Vec2::new(column as f32 + tent(v), row as f32 + tent(u));
+        self.geometry.corner(block) + (place + 0.5) * self.geometry.pixel()
+    }
+
+    fn groups_of(&self, region: u8) -> Range<usize> {
+        let first = self.groups.partition_point(|g| g.region < region);
+        first..self.groups.partition_point(|g| g.region <= region)
+    }
+
+    /// What counts of all pixels of a block.
+    pub fn reconstruct(&self, group: &Group, row: usize, pixels: &mut [f32; PIXELS]) {
+        let rank = group.rank as usize;
+        let z = self.row(group, row);
+        // Columns of one component side by side.
+        let mut x = [[0.0_f32; BLOCK]; MAX_RANK];
+        for column in 0..BLOCK {
+            for chunk in 0..rank.div_ceil(8) {
+                let values = self.factor(group, 1, column, chunk).to_array();
+                for (k, value) in values.into_iter().enumerate() {
+                    x[8 * chunk + k][column] = value;
+                }
+            }
+        }
+        let mut scales = [f32x8::ZERO; CHUNKS];
+        for (chunk, scale) in scales.iter_mut().enumerate().take(rank.div_ceil(8)) {
+            *scale = self.scale(group, chunk) * z[chunk];
+        }
+        for (row, pixels) in pixels.chunks_exact_mut(BLOCK).enumerate() {
+            let mut sums = [f32x8::ZERO; 2];
+            for (chunk, scale) in scales.iter().enumerate().take(rank.div_ceil(8)) {
+                let y = (*scale * self.factor(group, 0, row, chunk)).to_array();
+                for (y, x) in y.into_iter().zip(&x[8 * chunk..]) {
+                    let half = |h: usize| f32x8::from(std::array::from_fn(|k| x[8 * h + k]));
+                    sums[0] += f32x8::splat(y) * half(0);
+                    sums[1] += f32x8::splat(y) * half(1);
+                }
+            }
+            for (h, sum) in sums.into_iter().enumerate() {
+                pixels[8 * h..8 * h + 8].copy_from_slice(&sum.max(f32x8::ZERO).to_array());
+            }
+        }
+    }
+
+    /// Stores masses and totals, which follow from the rest.
+    pub fn weigh(&mut self) {
+        let images = self.geometry.images as usize;
+        let mut sums = vec![Vec::new(); images];
+        let mut pixels = [0.0; PIXELS];
+        for (index, group) in self.groups.iter().enumerate() {
+            let present = self.members.images[group.region as usize]
+                .iter()
+                .enumerate()
+                .filter(|&(local, _)| has(self.mask(index), local));
+            for (row, (_, &image)) in present.enumerate() {
+                self.reconstruct(group, row, &mut pixels);
+                sums[image as usize].push(pixels.iter().sum::<f32>());
+            }
+        }
+        let totals: Vec<f32> = sums
+            .iter()
+            .map(|sums| sums.iter().map(|&s| f64::from(s)).sum::<f64>() as f32)
+            .collect();
+        let masses: Vec<u16> = sums
+            .iter()
+            .zip(&totals)
+            .flat_map(|(sums, &total)| sums.iter().map(move |&sum| mass(sum, total)))
+            .collect();
+        self.inv_totals = totals
+            .iter()
+            .map(|&total| if total > 0.0 { 1.0 / total } else { 0.0 })
+            .collect();
+        self.parts.masses = masses.into();
+        self.parts.totals = totals.into();
+    }
+}
+
+/// A block's share of its image, rounded up.
+fn mass(sum: f32, total: f32) -> u16 {
+    if sum <= 0.0 {
+        return 0;
+    }
+    // A little more, so that rounding never makes the product with the unit smaller than the sum.
+    let exact = f64::from(sum) / f64::from(total) * f64::from(WHOLE);
+    (exact * (1.0 + 1e-6)).ceil().min(f64::from(WHOLE)) as u16
+}
+
+#[inline]
+fn has(mask: &[u64], bit: usize) -> bool {
+    mask[bit / 64] >> (bit % 64) & 1 == 1
+}
+
+/// Bits set before `bit`.
+#[inline]
+fn rank_of(mask: &[u64], bit: usize) -> usize {
+    let whole: u32 = mask[..bit / 64].iter().map(|word| word.count_ones()).sum();
+    (whole + (mask[bit / 64] & ((1 << (bit % 64)) - 1)).count_ones()) as usize
+}
+
+/// An index drawn with its value as probability, and a uniform number of what is left of `u`.
+fn choose(values: &[f32], u: f32) -> (usize, f32) {
+    let sum: f32 = values.iter().sum();
+    let mut left = u * sum;
+    let mut last = (0, 0.5);
+    for (i, &value) in values.iter().enumerate() {
+        if value > 0.0 {
+            if left < value {
+                return (i, (left / value).clamp(0.0, 1.0));
+            }
+            last = (i, 1.0);
+        }
+        left -= value;
+    }
+    last
+}
+
+/// The inverse distribution function of the tent over [-1, 1].
+fn tent(u: f32) -> f32 {
+    if u < 0.5 {
+        (2.0 * u).sqrt() - 1.0
+    } else {
+        1.0 - (2.0 * (1.0 - u)).max(0.0).sqrt()
+    }
+}
+
+/// Integral of a tent at zero up to x.
+fn tent_integral(x: f64) -> f64 {
+    let x = x.clamp(-1.0, 1.0);
+    if x < 0.0 {
+        0.5 * (1.0 + x).powi(2)
+    } else {
+        1.0 - 0.5 * (1.0 - x).powi(2)
+    }
+}
+
+impl Interval {
+    /// What counts of `pixels`, numbered from `origin` on, over `[a, b]`.
+    fn new(a: f64, b: f64, pixels: Range<usize>, origin: usize) -> Self {
+        let mut interval = Self {
+            whole: pixels.start - origin..pixels.start - origin,
+            ..Self::default()
+        };
+        for pixel in pixels {
+            let i = pixel as f64;
+            if a <= i - 1.0 && i + 1.0 <= b {
+                if interval.whole.is_empty() {
+                    interval.whole.start = pixel - origin;
+                }
+                interval.whole.end = pixel - origin + 1;
+            } else {
+                let weight = tent_integral(b - i) - tent_integral(a - i);
+                if weight > 0.0 && !interval.parts.is_full() {
+                    interval.parts.push((pixel - origin, weight as f32));
+                }
+            }
+        }
+        interval
+    }
+}
+
+impl<const N: usize> Products<N> {
+    #[inline]
+    fn dot(&self, pixel: usize, z: &[f32x8; CHUNKS]) -> f32 {
+        let mut sum = f32x8::ZERO;
+        for chunk in 0..self.chunks {
+            sum += self.values[pixel][chunk] * z[chunk];
+        }
+        sum.reduce_add()
+    }
+}
