@@ -78,6 +78,10 @@ bridge::FilterOptions to_bridge(const FilterOptions &o) {
     return {o.filter == FootprintFilter::Gaussian, o.footprint_sigma};
 }
 
+bridge::TensorOptions to_bridge(const TensorOptions &o) {
+    return {o.rank, o.error, o.resolution, o.stride, o.published};
+}
+
 Drawn from_bridge(bridge::Drawn drawn) {
     switch (drawn) {
     case bridge::Drawn::Flake:
@@ -220,6 +224,28 @@ Brdf Brdf::yan16(const NormalMap &map, const SurfaceOptions &surface, const Yan1
     return translated([&] {
         bridge::Yan16Options given{options.curved, options.refinement, options.footprint_sigma};
         return Brdf(std::make_unique<Impl>(Impl{bridge::yan16(*map.m_impl->map, to_bridge(surface), given)}));
+    });
+}
+
+Brdf Brdf::tensor(const NormalMap &map, const SurfaceOptions &surface, const TensorOptions &options,
+                  const std::string &cache) {
+    return translated([&] {
+        return Brdf(std::make_unique<Impl>(
+            Impl{bridge::tensor(*map.m_impl->map, to_bridge(surface), to_bridge(options), utf8(cache))}));
+    });
+}
+
+std::string Brdf::tensor_cache_file(const NormalMap &map, const SurfaceOptions &surface, const TensorOptions &options,
+                                    const std::string &cache) {
+    return translated([&] {
+        return std::string(
+            bridge::tensor_cache_file(*map.m_impl->map, to_bridge(surface), to_bridge(options), utf8(cache)));
+    });
+}
+
+Brdf Brdf::tensor_from_file(const std::string &filename, const SurfaceOptions &surface) {
+    return translated([&] {
+        return Brdf(std::make_unique<Impl>(Impl{bridge::tensor_from_file(utf8(filename), to_bridge(surface))}));
     });
 }
 

@@ -134,6 +134,15 @@ struct GLINTS_API Yan16Options {
     float footprint_sigma = 0.5f; ///< standard deviation of the Gaussian footprint in pixels, in [0.05, 4]
 };
 
+/// Parameters of Deng et al. 2022; numbers of zero are the method's own.
+struct GLINTS_API TensorOptions {
+    uint32_t rank = 0;       ///< largest rank of a group of blocks, 1 to 64
+    float error = 0.f;       ///< relative error of a group at which a smaller rank is taken; 0: always the largest
+    uint32_t resolution = 0; ///< pixels per side of an image, a multiple of 16
+    uint32_t stride = 0;     ///< texels between the images of the finest level
+    bool published = false;  ///< the published solver: one rank, at most 500 iterations
+};
+
 /// A pixel's footprint: the parallelogram centred at (u, v), spanned by the two partial derivatives.
 struct Footprint {
     float u, v;
@@ -228,6 +237,15 @@ public:
     /// Position-normal distribution of 4D Gaussians, Yan et al. 2016. `surface.normalization` has to be `Projected`,
     /// and `surface.distribution` `Beckmann`.
     static Brdf yan16(const NormalMap &map, const SurfaceOptions &surface, const Yan16Options &options = {});
+    /// Tensor-decomposed distributions, Deng et al. 2022. They are precomputed, which takes minutes for a large map, and
+    /// saved to the folder `cache`; the next time they are found there. `surface.normalization` has to be `Projected`.
+    static Brdf tensor(const NormalMap &map, const SurfaceOptions &surface, const TensorOptions &options,
+                       const std::string &cache);
+    /// The file in `cache` that `tensor` loads, or makes if it does not exist.
+    static std::string tensor_cache_file(const NormalMap &map, const SurfaceOptions &surface,
+                                         const TensorOptions &options, const std::string &cache);
+    /// A precomputation that `glints precompute tensor` saved. The roughness and distribution of flakes are the file's.
+    static Brdf tensor_from_file(const std::string &filename, const SurfaceOptions &surface);
 
     Evaluation evaluate(const Footprint &footprint, const Vec3 &wi, const Vec3 &wo) const noexcept;
     /// `evaluate(...).value` alone, and `evaluate(...).pdf` alone.

@@ -183,7 +183,7 @@ static glints::Brdf load_brdf(const mitsuba::Properties &props, const glints::No
     }
 
     glints::SurfaceOptions surface = common; // what a scene leaves open is as the file was made for
-    std::string file = glints_mitsuba::structure_file(props);
+    std::string file = glints_mitsuba::file_parameter(props, name);
     glints::SavedStructure saved = glints::SavedStructure::read(file);
     if (!props.has_property("alpha"))
         surface.alpha = saved.alpha;
@@ -197,5 +197,6 @@ static glints::Brdf load_brdf(const mitsuba::Properties &props, const glints::No
 }
 
 extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {
-    glints_mitsuba::register_bsdf(name, fn, {make_brdf, glints_mitsuba::Footprints::Used, load_brdf});
+    glints_mitsuba::register_bsdf(name, fn,
+                                  {make_brdf, glints_mitsuba::Footprints::Used, "structure_file", load_brdf});
 }

@@ -22,7 +22,7 @@ namespace {
 
 /// Loads the structure where the method can and the scene names one, else builds it from the map.
 glints::Brdf make_brdf(const Method &method, const Properties &props, const Parameters &parameters) {
-    bool is_saved = method.load_brdf && props.has_property("structure_file");
+    bool is_saved = method.saved && props.has_property(method.saved);
     std::optional<glints::NormalMap> map;
     if (!is_saved || !parameters.filename.empty())
         map = load_map(parameters);
@@ -42,8 +42,8 @@ glints::Brdf make_brdf(const Method &method, const Properties &props, const Para
 
 /// What the surface comes from, for messages: the saved structure, if there is one, or the map.
 std::string source(const Method &method, const Properties &props, const Parameters &parameters) {
-    if (method.load_brdf && props.has_property("structure_file"))
-        return structure_file(props);
+    if (method.saved && props.has_property(method.saved))
+        return file_parameter(props, method.saved);
     return parameters.filename;
 }
 

@@ -118,8 +118,8 @@ glints::FilterOptions filter_parameters(const Properties &props) {
     return options;
 }
 
-std::string structure_file(const Properties &props) {
-    return file_resolver()->resolve(props.get<std::string_view>("structure_file")).string();
+std::string file_parameter(const Properties &props, const char *name) {
+    return file_resolver()->resolve(props.get<std::string_view>(name)).string();
 }
 
 void refuse_together(const Properties &props, const char *a, std::initializer_list<const char *> others,
@@ -166,7 +166,7 @@ Parameters::Parameters(const Properties &props) : plugin(props.plugin_name()) {
 
 void Parameters::read_map(const Properties &props) {
     if (props.has_property("filename"))
-        filename = file_resolver()->resolve(props.get<std::string_view>("filename")).string();
+        filename = file_parameter(props, "filename");
     encoding = glints::Encoding(choice_parameter(props, "encoding", {"auto", "unsigned", "signed"}));
     flip_y = props.get<bool>("flip_y", false);
 }

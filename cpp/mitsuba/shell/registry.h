@@ -19,8 +19,8 @@ namespace glints_mitsuba {
 using BrdfFactory = glints::Brdf (*)(const mitsuba::Properties &props, const glints::NormalMap &map,
                                      const glints::SurfaceOptions &surface);
 
-/// Loads the BRDF of one method from the file that the parameter `structure_file` names. `map`: null where the scene names
-/// no normal map.
+/// Loads the BRDF of one method from the file that the parameter `Method::saved` names. `map`: null where the scene names no
+/// normal map.
 using BrdfLoader = glints::Brdf (*)(const mitsuba::Properties &props, const glints::NormalMap *map,
                                     const glints::SurfaceOptions &surface);
 
@@ -30,7 +30,9 @@ enum class Footprints { Used, Ignored };
 struct Method {
     BrdfFactory make_brdf;
     Footprints footprints;
-    BrdfLoader load_brdf = nullptr; ///< null: the method's structures are not saved
+    /// Parameter that names a saved structure, in the place of the map or beside it; null: the method's are not saved.
+    const char *saved = nullptr;
+    BrdfLoader load_brdf = nullptr;
 };
 
 /// Offers a BSDF plugin to Mitsuba in all supported variants. Called by the plugin's `init_plugin`.
@@ -57,8 +59,8 @@ GLINTS_MITSUBA_API glints::InterpolationOptions interpolation_parameters(const m
 /// The parameters `footprint_filter` and `footprint_sigma` of the plugins that know more than one filter.
 GLINTS_MITSUBA_API glints::FilterOptions filter_parameters(const mitsuba::Properties &props);
 
-/// The file that the parameter `structure_file` names, as the file resolver finds it.
-GLINTS_MITSUBA_API std::string structure_file(const mitsuba::Properties &props);
+/// The file that a parameter names, as the file resolver finds it.
+GLINTS_MITSUBA_API std::string file_parameter(const mitsuba::Properties &props, const char *name);
 
 /// Refuses the parameter `a`, which is given, beside the first of the others that is given, too.
 GLINTS_MITSUBA_API void refuse_together(const mitsuba::Properties &props, const char *a,

@@ -24,6 +24,7 @@ use glints::methods::Method;
 use glints::methods::compact::CompactBinMap;
 use glints::methods::direct::Direct;
 use glints::methods::inverse_bin_map::{self, Binning, InverseBinMap, SpecularBinMap, SpecularOptions};
+use glints::methods::tensor::{self, Tensor};
 use glints::methods::unfiltered::{Interpolation, Unfiltered};
 use glints::methods::yan16::{self, Elements, Yan16};
 use glints::microfacet::{Distribution, Flake};
@@ -148,6 +149,16 @@ mod ffi {
         footprint_sigma: f32,
     }
 
+    /// Numbers of zero: the method's own.
+    #[derive(Clone, Copy)]
+    struct TensorOptions {
+        rank: u32,
+        error: f32,
+        resolution: u32,
+        stride: u32,
+        published: bool,
+    }
+
     #[derive(Clone, Copy)]
     struct FlakeLayerOptions {
         bins: u32,
@@ -217,6 +228,16 @@ mod ffi {
         fn load_inverse_bin_map_of(map: &Map, filename: &str, surface: Surface) -> Result<Box<Brdf>>;
         fn unfiltered(map: &Map, surface: Surface, bilinear: bool) -> Result<Box<Brdf>>;
         fn yan16(map: &Map, surface: Surface, options: Yan16Options) -> Result<Box<Brdf>>;
+        /// The file of a precomputation in the folder `cache`, whether it is there or not.
+        fn tensor_cache_file(
+            map: &Map,
+            surface: Surface,
+            options: TensorOptions,
+            cache: &str,
+        ) -> Result<String>;
+        fn tensor(map: &Map, surface: Surface, options: TensorOptions, cache: &str) -> Result<Box<Brdf>>;
+        /// `surface` without the roughness and the distribution of flakes, which are the file's.
+        fn tensor_from_file(filename: &str, surface: Surface) -> Result<Box<Brdf>>;
         fn evaluate(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> Evaluation;
         fn pdf(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> f32;
         fn sample(self: &Brdf, footprint: Footprint, wi: Vector, u: [f32; 3]) -> Sample;
@@ -508,6 +529,61 @@ fn yan16(map: &Map, surface: ffi::Surface, options: ffi::Yan16Options) -> Result
         };
         Ok(Box::new(Yan16::new(&map, options)?))
     })
+}
+
+fn tensor_options(options: ffi::TensorOptions) -> tensor::Options {
+    let own = if options.published {
+        tensor::Options::published()
+    } else {
+        tensor::Options::default()
+    };
+    let or = |given: u32, own: u32| if given > 0 { given } else { own };
+    tensor::Options {
+        rank: or(options.rank, own.rank),
+        resolution: or(options.resolution, own.resolution),
+        stride: or(options.stride, own.stride),
+        error: if options.error > 0.0 {
+            options.error
+        } else {
+            own.error
+        },
+        ..own
+    }
+}
+
+fn tensor_cache_file(
+    map: &Map,
+    surface: ffi::Surface,
+    options: ffi::TensorOptions,
+    cache: &str,
+) -> Result<String> {
+    guarded("filename", map.0.name(), || {
+        let path = tensor::cache_path(
+            &map.0,
+            flakes(surface)?,
+            &tensor_options(options),
+            Path::new(cache),
+        );
+        Ok(path.display().to_string())
+    })
+}
+
+fn tensor(map: &Map, surface: ffi::Surface, options: ffi::TensorOptions, cache: &str) -> Result<Box<Brdf>> {
+    build(map, surface, AS_IT_IS, |map| {
+        let options = tensor_options(options);
+        let (tensor, _) = Tensor::cached(&map, flakes(surface)?, &options, Path::new(cache), &|_| ())?;
+        Ok(Box::new(tensor))
+    })
+}
+
+fn tensor_from_file(filename: &str, surface: ffi::Surface) -> Result<Box<Brdf>> {
+    let start = Instant::now();
+    let (tensor, map) = guarded("ndf_file", filename, || Tensor::load(Path::new(filename)))?;
+    let alpha = tensor.model().flake.alpha();
+    let surface = ffi::Surface { alpha, ..surface };
+    let mut brdf = build(&Map(map), surface, AS_IT_IS, |_| Ok(Box::new(tensor)))?;
+    brdf.build_seconds = start.elapsed().as_secs_f64();
+    Ok(brdf)
 }
 
 fn flakes(surface: ffi::Surface) -> Result<FlakeModel> {

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use glints::flakes::{FlakeModel, Normalization};
 use glints::methods::compact::Header;
+use glints::methods::tensor;
 use glints::microfacet::{self, Flake};
 use glints::normal_map::{self, NormalMap};
 use glints::refinement::{MAX_REFINEMENT, Refinement};
@@ -113,6 +114,61 @@ impl FlakeArguments {
         let flake = Flake::new(found.distribution, found.alpha)?;
         let normalization = found.normalization;
         Ok((found, FlakeModel { flake, normalization }))
+    }
+}
+
+/// Of tensor-decomposed distributions.
+#[derive(Args)]
+pub struct TensorOptions {
+    /// Largest rank of a group of blocks, 1 to 64: memory and time against accuracy; discrete flakes ask for 32
+    #[arg(long, default_value_t = 16)]
+    rank: u32,
+
+    /// Relative error of a group at which a smaller rank is taken; 0: all groups have the same
+    #[arg(long, value_name = "ERROR", default_value_t = 0.0)]
+    rank_error: f32,
+
+    /// Texels between images of the finest level
+    #[arg(long, value_name = "TEXELS", default_value_t = 32)]
+    stride: u32,
+
+    /// Pixels per side of an image of the hemisphere, a multiple of 16
+    #[arg(long, value_name = "PIXELS", default_value_t = 256)]
+    resolution: u32,
+
+    /// Relative error of a decomposition at which the solver stops
+    #[arg(long, value_name = "ERROR", default_value_t = 1e-4)]
+    tolerance: f64,
+
+    /// Relative L1 difference of neighbouring levels below which the coarser one is left out
+    #[arg(long, value_name = "DIFFERENCE", default_value_t = 0.02)]
+    agreement: f32,
+
+    /// The solver as published: random start, up to 500 iterations
+    #[arg(long)]
+    published: bool,
+}
+
+impl TensorOptions {
+    pub fn options(&self) -> Result<tensor::Options> {
+        let own = match self.published {
+            true => tensor::Options::published(),
+            false => tensor::Options::default(),
+        };
+        let options = tensor::Options {
+            rank: self.rank,
+            error: self.rank_error,
+            stride: self.stride,
+            resolution: self.resolution,
+            agreement: self.agreement,
+            solver: tensor::cp::Options {
+                tolerance: self.tolerance,
+                ..own.solver
+            },
+            ..own
+        };
+        options.check()?;
+        Ok(options)
     }
 }
 

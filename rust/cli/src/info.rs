@@ -8,6 +8,7 @@ use glam::{DVec3, Vec3};
 use glints::flakes::{FlakeModel, Normalization};
 use glints::methods::Method;
 use glints::methods::compact::Header;
+use glints::methods::tensor;
 use glints::microfacet;
 use glints::normal_map::{Encoding, NormalMap};
 use serde_json::{Value, json};
@@ -75,6 +76,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             format!("{header}\n")
         });
     }
+    if tensor::is_saved(&arguments.map.map) {
+        let header = tensor::read_header(&arguments.map.map)?;
+        return output::print(&if arguments.json {
+            format!("{}\n", saved_tensor(&header, &arguments.map.map))
+        } else {
+            format!("{header}\n")
+        });
+    }
     // Wrong roughnesses are told before a long read.
     let models = arguments
         .alpha
@@ -109,6 +118,27 @@ fn saved(header: &Header, path: &Path) -> Value {
         },
         "texel_bytes": header.texel_bytes,
         "count_bytes": header.count_bytes,
+        "file_bytes": header.file_bytes,
+    })
+}
+
+fn saved_tensor(header: &tensor::Header, path: &Path) -> Value {
+    json!({
+        "structure": path.display().to_string(),
+        "file_format": header.version,
+        "width": header.map.0,
+        "height": header.map.1,
+        "alpha": decimal(header.alpha),
+        "distribution": match header.distribution {
+            microfacet::Distribution::Beckmann => "beckmann",
+            microfacet::Distribution::Ggx => "ggx",
+        },
+        "resolution": header.resolution,
+        "stride": header.stride,
+        "levels": header.levels,
+        "groups": header.groups,
+        "mean_rank": header.mean_rank,
+        "image_bytes": header.image_bytes,
         "file_bytes": header.file_bytes,
     })
 }

@@ -10,6 +10,7 @@ use glints::footprint_filter::FootprintFilter;
 use glints::methods::Method;
 use glints::methods::compact::Header;
 use glints::methods::direct::Direct;
+use glints::methods::tensor;
 use glints::methods::unfiltered::{Interpolation, Unfiltered};
 use glints::methods::yan16::{self, Elements, Yan16};
 use glints::microfacet;
@@ -164,6 +165,8 @@ enum MethodName {
     Yan16,
     /// The same with curved elements: the interpolated map
     Yan16Curved,
+    /// Tensor-decomposed distributions, rank 16 (Deng et al. 2022); takes minutes for a large map
+    Tensor,
     /// The one texel under the point
     Unfiltered,
 }
@@ -195,7 +198,7 @@ impl MethodName {
         bilinear: bool,
         filter: &FilterArguments,
     ) -> Result<Box<dyn Method>> {
-        let _progress = Progress::spinner("building the structure");
+        let _progress = (self != Self::Tensor).then(|| Progress::spinner("building the structure"));
         let mixture = |elements| -> Result<Box<dyn Method>> {
             let options = yan16::Options {
                 elements,
@@ -212,6 +215,7 @@ impl MethodName {
             Self::Yan16Curved => mixture(Elements::Curved {
                 refinement: yan16::resolving_refinement(map),
             })?,
+            Self::Tensor => Box::new(structures::tensor(map, model, &tensor::Options::default())?.0),
             Self::Unfiltered => {
                 let interpolation = match bilinear {
                     true => Interpolation::Bilinear,
@@ -227,6 +231,11 @@ impl MethodName {
         if self == Self::Yan16 && interpolation == arguments::Interpolation::Bilinear {
             return Err(Failure::usage(
                 "parameter \"interpolation\" = bilinear: the elements of yan16 are flat; take yan16_curved",
+            ));
+        }
+        if self == Self::Tensor && interpolation == arguments::Interpolation::Bilinear {
+            return Err(Failure::usage(
+                "parameter \"interpolation\" = bilinear: tensor is made from flat texels; leave the parameter out",
             ));
         }
         if matches!(self, Self::Yan16 | Self::Yan16Curved) && distribution != Distribution::Beckmann {

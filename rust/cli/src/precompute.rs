@@ -2,10 +2,12 @@
 
 use std::borrow::Cow;
 use std::path::PathBuf;
+use std::time::Instant;
 
 use clap::{Args, Subcommand};
+use serde_json::json;
 
-use crate::arguments::{FlakeArguments, InterpolationArguments, MapArguments, refined};
+use crate::arguments::{FlakeArguments, InterpolationArguments, MapArguments, TensorOptions, refined};
 use crate::failure::Result;
 use crate::output::{self, Destination};
 use crate::progress::Progress;
@@ -15,6 +17,7 @@ use crate::structures;
 #[derive(Subcommand)]
 pub enum Command {
     Ibm(IbmArguments),
+    Tensor(TensorArguments),
 }
 
 /// The inverse bin map of a normal map for flakes of one roughness
@@ -46,8 +49,89 @@ pub struct IbmArguments {
     force: bool,
 }
 
+/// Tensor-decomposed distributions of normals of a normal map (Deng et al. 2022), for flakes of one roughness
+///
+/// Distributions for footprints of all places and sizes, as images of the hemisphere, compressed. The file stands for the map,
+/// --alpha and --distribution: `glints_tensor` takes it as `ndf_file`. It takes minutes for a large map, on all cores.
+/// `glints info FILE` tells what it holds. The file appears when it is complete; nothing is left of an interrupted
+/// computation.
+///
+/// Example: glints precompute tensor flakes.exr --alpha 0.01 --rank 32 -o flakes.glints
+#[derive(Args)]
+#[command(verbatim_doc_comment)]
+pub struct TensorArguments {
+    #[command(flatten)]
+    map: MapArguments,
+
+    #[command(flatten)]
+    flake: FlakeArguments,
+
+    #[command(flatten)]
+    tensor: TensorOptions,
+
+    /// File to write
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+
+    /// Overwrite the file if it exists
+    #[arg(long)]
+    force: bool,
+
+    /// Print one line of JSON
+    #[arg(long)]
+    json: bool,
+}
+
 pub fn run(command: &Command) -> Result<()> {
-    let Command::Ibm(arguments) = command;
+    match command {
+        Command::Ibm(arguments) => ibm(arguments),
+        Command::Tensor(arguments) => tensor(arguments),
+    }
+}
+
+fn tensor(arguments: &TensorArguments) -> Result<()> {
+    let destination = Destination::new(&arguments.output, arguments.force, &[&arguments.map.map])?;
+    let model = arguments.flake.model()?;
+    let options = arguments.tensor.options()?;
+    let map = arguments.map.load()?;
+    let start = Instant::now();
+    let (structure, report) = structures::tensor(&map, model, &options)?;
+    let seconds = start.elapsed().as_secs_f64();
+    output::write_files(&[&destination], |files| Ok(structure.save(&map, &files[0])?))?;
+    let (image_bytes, exact_bytes) = structure.bytes();
+    let facts = json!({
+        "output": destination.path().display().to_string(),
+        "seconds": seconds,
+        "pyramid_thread_seconds": report.pyramid_seconds,
+        "solver_thread_seconds": report.solver_seconds,
+        "levels": report.levels.1,
+        "agreement": report.agreement,
+        "groups": report.groups,
+        "blocks": report.blocks,
+        "mean_rank": structure.mean_rank(),
+        "iterations": report.iterations,
+        "relative_error": report.relative_error,
+        "image_bytes": image_bytes,
+        "exact_bytes": exact_bytes,
+    });
+    output::print(&if arguments.json {
+        format!("{facts}\n")
+    } else {
+        format!(
+            "{}: {:.2} MB of compressed images in {seconds:.1} s\n{} levels, {} groups of mean rank {:.1}, relative L2 error \
+             {:.4}\nsmall footprints take {:.1} MB more when the file is loaded\n",
+            destination.path().display(),
+            image_bytes as f64 / 1e6,
+            report.levels.1,
+            report.groups,
+            structure.mean_rank(),
+            report.relative_error,
+            exact_bytes as f64 / 1e6,
+        )
+    })
+}
+
+fn ibm(arguments: &IbmArguments) -> Result<()> {
     let destination = Destination::new(&arguments.output, arguments.force, &[&arguments.map.map])?;
     let model = arguments.flake.model()?;
     arguments.interpolation.check()?;

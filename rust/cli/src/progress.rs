@@ -55,6 +55,11 @@ impl Progress {
         }
     }
 
+    /// `steps` are done.
+    pub fn reach(&self, steps: u64) {
+        self.bar.set_position(steps);
+    }
+
     /// `steps` more are done.
     pub fn advance(&self, steps: u64) {
         self.bar.inc(steps);

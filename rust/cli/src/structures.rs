@@ -6,10 +6,12 @@ use glints::flakes::FlakeModel;
 use glints::methods::Method;
 use glints::methods::compact::{self, CompactBinMap, Header};
 use glints::methods::inverse_bin_map::{InverseBinMap, Options};
+use glints::methods::tensor::{self, Tensor};
 use glints::normal_map::NormalMap;
 use glints::saved::{Flakes, SavedMap};
 
 use crate::failure::Result;
+use crate::progress::Progress;
 
 /// What `precompute` saves.
 pub type Structure = CompactBinMap;
@@ -22,6 +24,18 @@ pub fn ibm(map: &NormalMap, model: FlakeModel) -> Structure {
 /// The structure as published.
 pub fn ibm_paper(map: &NormalMap, model: FlakeModel) -> Result<Box<dyn Method>> {
     Ok(Box::new(InverseBinMap::new(map, model, Options::default())?))
+}
+
+/// Tensor-decomposed distributions.
+pub fn tensor(
+    map: &NormalMap,
+    model: FlakeModel,
+    options: &tensor::Options,
+) -> Result<(Tensor, tensor::Report)> {
+    const STEPS: u64 = 1000;
+    let progress = Progress::bar("precomputing distributions", STEPS);
+    let shown = |share: f64| progress.reach((share * STEPS as f64) as u64);
+    Ok(Tensor::new(map, model, options, &shown)?)
 }
 
 /// Writes a structure to a file.

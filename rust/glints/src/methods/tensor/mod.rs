@@ -117,7 +117,9 @@ impl Options {
         }
     }
 
-    fn check(&self) -> Result<()> {
+    /// # Errors
+    /// A parameter is outside its domain.
+    pub fn check(&self) -> Result<()> {
         if self.resolution % BLOCK as u32 != 0 || !(32..=1024).contains(&self.resolution) {
             let reason = "must be the pixels per side of an image, a multiple of 16 in 32 to 1024";
             return Err(Error::parameter("resolution", self.resolution, reason));
@@ -193,6 +195,11 @@ impl Tensor {
     /// Bytes of the images, and of the exact method for small footprints.
     pub fn bytes(&self) -> (usize, usize) {
         (self.images.bytes(), self.exact.structure_bytes())
+    }
+
+    /// The flakes that it was made for.
+    pub fn model(&self) -> FlakeModel {
+        self.model
     }
 
     /// Mean rank of a group.

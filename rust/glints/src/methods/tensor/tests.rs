@@ -138,7 +138,7 @@ fn means_over_rectangles_are_means_of_points() {
         shifted += usize::from(off > 2e-4 * (1.0 + sum.abs() / area));
     }
     assert!(negative < 60 && shifted > 50, "{negative} {shifted}");
-    }
+}
 
 /// Quadrature nodes with weights over [low, high], cut where the centres of pixels are.
 fn nodes(low: f32, high: f32, pixel: f32) -> Vec<(f64, f64)> {
@@ -251,7 +251,7 @@ fn a_wrong_density_is_found() {
     // Pixels without interpolation.
     let pixel = images.geometry.pixel();
     let uninterpolated = |p: Vec2| images.density(&blend, ((p / pixel).floor() + 0.5) * pixel);
-    for wrong in [&unclamped as &dyn Fn(Vec2) -> f32, &wrong_level, &uninterpolated] {
+    for wrong in [&wrong_pdf as &dyn Fn(Vec2) -> f32, &wrong_level, &uninterpolated] {
         assert!(!agrees(chi_square(&tensor, &footprint, count, wrong)));
     }
 }
