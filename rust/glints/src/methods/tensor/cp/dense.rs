@@ -1,108 +1,68 @@
-//! Small dense matrices in double precision: what the normal equations and the initialisation need.
+//! Small dense matrices in double precision, n x n with n a multiple of eight: the normal equations.
 
-/// The inverse of a symmetric positive definite matrix, `matrix[row * n + column]`, by its Cholesky factor.
+use wide::f64x4;
+
+/// Replaces a symmetric positive definite matrix, `matrix[row * n + column]`, by its inverse: Gauss-Jordan elimination with
+/// pivots from the diagonal.
 ///
-/// A row and column whose diagonal element is not positive is left out: its part of the inverse is zero.
-pub fn inverse(matrix: &[f64], n: usize) -> Vec<f64> {
-    let factor = cholesky(matrix, n);
-    // The inverse of the lower triangle, by columns of the identity.
-    let mut lower = vec![0.0; n * n];
-    for column in 0..n {
-        for row in column..n {
-            let pivot = factor[row * n + row];
-            if pivot > 0.0 {
-                let known: f64 = (column..row)
-                    .map(|k| factor[row * n + k] * lower[k * n + column])
-                    .sum();
-                let identity = if row == column { 1.0 } else { 0.0 };
-                lower[row * n + column] = (identity - known) / pivot;
+/// A row and column whose diagonal element is zero, or eaten by rounding, is left out: its part of the inverse is zero.
+pub fn invert(matrix: &mut [f64], n: usize) {
+    let smallest: Vec<f64> = (0..n).map(|k| 1e-14 * matrix[k * n + k]).collect();
+    let mut left_out = Vec::new();
+    let mut pivot_row = vec![0.0; n];
+    for pivot in 0..n {
+        let value = matrix[pivot * n + pivot];
+        if value <= smallest[pivot] {
+            left_out.push(pivot);
+            continue;
+        }
+        pivot_row.copy_from_slice(&matrix[pivot * n..][..n]);
+        pivot_row[pivot] = 1.0;
+        for element in &mut pivot_row {
+            *element /= value;
+        }
+        for row in matrix.chunks_exact_mut(n) {
+            let scale = row[pivot];
+            row[pivot] = 0.0;
+            for (elements, pivots) in row.chunks_exact_mut(8).zip(pivot_row.chunks_exact(8)) {
+                for (element, &pivot) in elements.iter_mut().zip(pivots) {
+                    *element -= scale * pivot;
+                }
             }
         }
+        matrix[pivot * n..][..n].copy_from_slice(&pivot_row);
     }
-    let mut inverse = vec![0.0; n * n];
-    for k in 0..n {
-        for row in 0..=k {
-            let scale = lower[k * n + row];
-            for column in 0..=k {
-                inverse[row * n + column] += scale * lower[k * n + column];
+    for k in left_out {
+        for other in 0..n {
+            matrix[k * n + other] = 0.0;
+            matrix[other * n + k] = 0.0;
+        }
+    }
+}
+
+/// `result[row * n + r] = sum_k left(row, k) right[k * n + r]` for n a multiple of eight, where
+/// `left(row, k) = left[row * steps[0] + k * steps[1]]`.
+pub fn multiply(left: &[f64], steps: [usize; 2], right: &[f64], n: usize, result: &mut [f64]) {
+    const ROWS: usize = 4;
+    let rows = result.len() / n;
+    for first in (0..rows).step_by(ROWS) {
+        // Rows behind the last one repeat it.
+        let starts: [usize; ROWS] = std::array::from_fn(|row| (first + row).min(rows - 1) * steps[0]);
+        for column in (0..n).step_by(8) {
+            let mut sums = [[f64x4::ZERO; 2]; ROWS];
+            for (k, right) in right.chunks_exact(n).enumerate() {
+                let right: &[f64; 8] = right[column..column + 8].try_into().expect("eight values");
+                let right: [f64x4; 2] = bytemuck::cast(*right);
+                for (sums, start) in sums.iter_mut().zip(starts) {
+                    let left = f64x4::splat(left[start + k * steps[1]]);
+                    sums[0] = left.mul_add(right[0], sums[0]);
+                    sums[1] = left.mul_add(right[1], sums[1]);
+                }
+            }
+            for (sums, row) in sums.iter().zip(first..rows) {
+                result[row * n + column..][..8].copy_from_slice(bytemuck::cast_slice(sums));
             }
         }
-    }
-    inverse
-}
-
-/// The lower triangle L with `matrix = L L^T`; a pivot that rounding has eaten makes its row and column zero.
-fn cholesky(matrix: &[f64], n: usize) -> Vec<f64> {
-    let mut factor = vec![0.0; n * n];
-    for row in 0..n {
-        for column in 0..=row {
-            let known: f64 = (0..column)
-                .map(|k| factor[row * n + k] * factor[column * n + k])
-                .sum();
-            let rest = matrix[row * n + column] - known;
-            factor[row * n + column] = if column < row {
-                let pivot = factor[column * n + column];
-                if pivot > 0.0 { rest / pivot } else { 0.0 }
-            } else if rest > 1e-14 * matrix[row * n + row] {
-                rest.sqrt()
-            } else {
-                0.0
-            };
-        }
-    }
-    factor
-}
-
-/// Orthonormal eigenvectors of a symmetric matrix, `[vector * n + element]`, largest eigenvalue first: Jacobi's method,
-/// row by row (Golub and Van Loan, Matrix Computations, Section 8.5).
-pub fn eigenvectors(mut matrix: Vec<f64>, n: usize) -> Vec<f64> {
-    let mut vectors = vec![0.0; n * n];
-    for k in 0..n {
-        vectors[k * n + k] = 1.0;
-    }
-    let total: f64 = matrix.iter().map(|a| a * a).sum();
-    // Converges quadratically: ten rounds are more than any matrix of a few dozen rows needs.
-    for _ in 0..10 {
-        let mut off_diagonal = 0.0;
-        for p in 0..n {
-            for q in p + 1..n {
-                off_diagonal += matrix[p * n + q].powi(2);
-                rotate(&mut matrix, &mut vectors, n, p, q);
-            }
-        }
-        if off_diagonal <= 1e-20 * total {
-            break;
-        }
-    }
-    let mut order: Vec<usize> = (0..n).collect();
-    order.sort_by(|&a, &b| matrix[b * n + b].total_cmp(&matrix[a * n + a]));
-    order
-        .iter()
-        .flat_map(|&k| vectors[k * n..][..n].to_vec())
-        .collect()
-}
-
-/// Makes element (p, q) zero.
-fn rotate(matrix: &mut [f64], vectors: &mut [f64], n: usize, p: usize, q: usize) {
-    let off = matrix[p * n + q];
-    if off == 0.0 {
-        return;
-    }
-    let tau = (matrix[q * n + q] - matrix[p * n + p]) / (2.0 * off);
-    let tangent = tau.signum() / (tau.abs() + (1.0 + tau * tau).sqrt());
-    let cosine = 1.0 / (1.0 + tangent * tangent).sqrt();
-    let sine = tangent * cosine;
-    let turn = |a: &mut [f64], first: usize, second: usize| {
-        let (x, y) = (a[first], a[second]);
-        a[first] = cosine * x - sine * y;
-        a[second] = sine * x + cosine * y;
-    };
-    for k in 0..n {
-        turn(matrix, k * n + p, k * n + q);
-    }
-    for k in 0..n {
-        turn(matrix, p * n + k, q * n + k);
-        turn(vectors, p * n + k, q * n + k);
     }
 }
 
@@ -124,9 +84,12 @@ mod tests {
 
     #[test]
     fn inverse_times_matrix_is_identity() {
-        for n in [1, 4, 9] {
-            let matrix = gram(n, 23);
-            for (k, value) in product(&matrix, &inverse(&matrix, n), n).iter().enumerate() {
+        for n in [8, 16, 32] {
+            let mut matrix = gram(n, 97);
+            (0..n).for_each(|k| matrix[k * n + k] += 1.0);
+            let mut inverse = matrix.clone();
+            invert(&mut inverse, n);
+            for (k, value) in product(&matrix, &inverse, n).iter().enumerate() {
                 let identity = if k / n == k % n { 1.0 } else { 0.0 };
                 assert!((value - identity).abs() < 1e-9, "{value} at {k}");
             }
@@ -135,21 +98,29 @@ mod tests {
 
     #[test]
     fn inverse_of_singular_matrix_is_finite() {
-        assert_eq!(inverse(&[0.0; 9], 3), [0.0; 9]);
-        assert_eq!(inverse(&[1.0, 1.0, 1.0, 1.0], 2), [1.0, 0.0, 0.0, 0.0]);
+        let mut zero = [0.0; 64];
+        invert(&mut zero, 8);
+        assert_eq!(zero, [0.0; 64]);
+        let mut ones = [1.0; 64];
+        invert(&mut ones, 8);
+        let mut expected = [0.0; 64];
+        expected[0] = 1.0;
+        assert_eq!(ones, expected);
     }
 
     #[test]
-    fn eigenvectors_diagonalise() {
-        for (n, rows) in [(1, 3), (7, 23), (16, 5)] {
-            let matrix = gram(n, rows);
-            let vectors = eigenvectors(matrix.clone(), n);
-            let transposed: Vec<f64> = (0..n * n).map(|e| vectors[e % n * n + e / n]).collect();
-            let diagonal = product(&product(&vectors, &matrix, n), &transposed, n);
-            for (k, value) in diagonal.iter().enumerate() {
-                assert!(k / n == k % n || value.abs() < 1e-9, "{value} at {k}");
+    fn products_of_every_shape_are_right() {
+        for (rows, inner, n) in [(1, 1, 8), (4, 3, 16), (7, 0, 8), (9, 5, 24)] {
+            let left: Vec<f64> = (0..rows * inner).map(|k| (k * 7 % 11) as f64 - 5.0).collect();
+            let right: Vec<f64> = (0..inner * n).map(|k| (k * 5 % 13) as f64 - 6.0).collect();
+            for steps in [[inner, 1], [1, rows]] {
+                let mut result = vec![f64::NAN; rows * n];
+                multiply(&left, steps, &right, n, &mut result);
+                for (e, value) in result.iter().enumerate() {
+                    let term = |k: usize| left[e / n * steps[0] + k * steps[1]] * right[k * n + e % n];
+                    assert_eq!(*value, (0..inner).map(term).sum::<f64>());
+                }
             }
-            assert!((1..n).all(|k| diagonal[k * n + k] <= diagonal[(k - 1) * n + k - 1] + 1e-12));
         }
     }
 }

@@ -28,6 +28,10 @@ impl Panels {
         }
     }
 
+    pub fn rows(&self) -> usize {
+        self.rows
+    }
+
     /// `result = self * thin`, both matrices with `width` vectors a row.
     pub fn multiply(&self, thin: &[f32x8], width: usize, result: &mut [f32x8]) {
         assert_eq!(thin.len(), self.columns * width);
