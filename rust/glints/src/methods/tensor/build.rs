@@ -23,6 +23,9 @@ pub struct Report {
     pub blocks: usize,
     /// Root of the sum of squared errors of all blocks over that of their values, of the decompositions before quantisation.
     pub relative_error: f64,
+    /// Of each level's images, before they are normalised: mean relative L1 error, and mean squared error of a pixel, of what
+    /// counts of the quantised decompositions against the images before compression, blank blocks included.
+    pub errors: Vec<(f64, f64)>,
     /// Iterations of the solver, of all groups.
     pub iterations: u64,
     /// Thread seconds in the pyramid and in the decompositions.
@@ -44,6 +47,8 @@ struct Compressed {
     squared_error: f64,
     square: f64,
     iterations: u64,
+    /// Sums over the pixels of each level of absolute and of squared errors.
+    errors: Vec<(f64, f64)>,
 }
 
 /// `progress` is called with the share of the work that is done, from any thread.
@@ -68,6 +73,7 @@ pub fn build(
     };
 
     let mut groups = Vec::new();
+    let mut lost = vec![(0.0, 0.0); geometry.levels.len()];
     let mut differences = vec![0.0; geometry.levels.len() - 1];
     // As many blocks at a time as there are threads: their memory is what the precomputation needs.
     for chunk in blocks.chunks(rayon::current_num_threads()) {
@@ -109,7 +115,10 @@ pub fn build(
                 group
             })
             .collect();
-        groups.extend(compressed.into_iter().flatten());
+        for (blank, group) in compressed {
+            add_errors(&mut lost, &blank);
+            groups.extend(group);
+        }
     }
 
     let pixel = f64::from(geometry.pixel());
@@ -126,6 +135,7 @@ pub fn build(
         groups: groups.len(),
         blocks: groups.iter().map(|g| g.images.len()).sum(),
         relative_error: (error / square.max(f64::MIN_POSITIVE)).sqrt(),
+        errors: mean_errors(&geometry, &groups, &lost),
         iterations: groups.iter().map(|g| g.iterations).sum(),
         pyramid_seconds: nanoseconds[0].load(Ordering::Relaxed) as f64 / 1e9,
         solver_seconds: nanoseconds[1].load(Ordering::Relaxed) as f64 / 1e9,
@@ -198,7 +208,47 @@ fn level_differences(geometry: &Geometry, images: &[f32]) -> Vec<f64> {
         .collect()
 }
 
-/// The group of a region: its blocks that are not blank, decomposed.
+type Errors = Vec<(f64, f64)>;
+
+fn add_errors(sums: &mut Errors, errors: &Errors) {
+    for (sum, error) in sums.iter_mut().zip(errors) {
+        sum.0 += error.0;
+        sum.1 += error.1;
+    }
+}
+
+/// Means over images and pixels.
+fn mean_errors(geometry: &Geometry, groups: &[Compressed], lost: &Errors) -> Errors {
+    let mut sums = lost.clone();
+    for group in groups {
+        add_errors(&mut sums, &group.errors);
+    }
+    let pixels = f64::from(geometry.resolution).powi(2);
+    let area = f64::from(geometry.pixel()).powi(2);
+    sums.iter()
+        .zip(&geometry.levels)
+        .map(|((absolute, squared), level)| {
+            let images = f64::from(level.images());
+            (absolute * area / images, squared / (pixels * images))
+        })
+        .collect()
+}
+
+/// Errors of approximations of blocks, by level.
+fn errors<'a>(geometry: &Geometry, blocks: impl Iterator<Item = (u32, &'a [f32], &'a [f32])>) -> Errors {
+    let mut sums = vec![(0.0, 0.0); geometry.levels.len()];
+    for (image, expected, found) in blocks {
+        let level = geometry.levels.partition_point(|level| level.first <= image) - 1;
+        for (expected, found) in expected.iter().zip(found) {
+            let error = f64::from((expected - found).abs());
+            sums[level].0 += error;
+            sums[level].1 += error * error;
+        }
+    }
+    sums
+}
+
+/// The group of a region: its blocks that are not blank, decomposed; and the errors of leaving out the blank ones.
 fn compress(
     members: &Members,
     images: &[f32],
@@ -206,15 +256,16 @@ fn compress(
     region: u8,
     geometry: &Geometry,
     options: &Options,
-) -> Option<Compressed> {
+) -> (Errors, Option<Compressed>) {
     let blank = options.blank / (geometry.pixel() * geometry.pixel());
-    let present: Vec<(u32, &[f32])> = members.images[region as usize]
+    let (present, left_out): (Vec<_>, Vec<_>) = members.images[region as usize]
         .iter()
         .map(|&image| (image, &images[image as usize * PIXELS..][..PIXELS]))
-        .filter(|(_, pixels)| pixels.iter().sum::<f32>() > blank)
-        .collect();
+        .partition(|(_, pixels)| pixels.iter().sum::<f32>() > blank);
+    let nothing = [0.0; PIXELS];
+    let lost = errors(geometry, left_out.into_iter().map(|(i, p)| (i, p, &nothing[..])));
     if present.is_empty() {
-        return None;
+        return (lost, None);
     }
     let values: Vec<f32> = present
         .iter()
@@ -242,7 +293,15 @@ fn compress(
     group.square = square;
     group.squared_error = square * result.relative_error.powi(2);
     group.iterations = result.iterations as u64;
-    Some(group)
+    let found = group.reconstructed();
+    group.errors = errors(
+        geometry,
+        present
+            .iter()
+            .zip(found.chunks_exact(PIXELS))
+            .map(|((image, pixels), found)| (*image, *pixels, found)),
+    );
+    (lost, Some(group))
 }
 
 /// Every component's vectors, each with the largest integer range it may have.
@@ -289,6 +348,37 @@ fn quantised(factors: &[Vec<f32>; 3], rank: usize, images: Vec<u32>) -> Compress
         squared_error: 0.0,
         square: 0.0,
         iterations: 0,
+        errors: Vec::new(),
+    }
+}
+
+impl Compressed {
+    /// What counts of all pixels, row after row of Z.
+    fn reconstructed(&self) -> Vec<f32> {
+        let rank = self.rank;
+        let line = |axis: usize, i: usize, r: usize| {
+            let at = |i: usize| f32::from(self.prefixes[(axis * BLOCK + i) * rank + r]);
+            if i == 0 { at(0) } else { at(i) - at(i - 1) }
+        };
+        // Products of rows and columns, component by component.
+        let mut products = vec![0.0; rank * PIXELS];
+        for (r, products) in products.chunks_exact_mut(PIXELS).enumerate() {
+            for (pixel, product) in products.iter_mut().enumerate() {
+                *product = self.scales[r] * line(0, pixel / BLOCK, r) * line(1, pixel % BLOCK, r);
+            }
+        }
+        let mut values = vec![0.0; self.images.len() * PIXELS];
+        for (values, row) in values.chunks_exact_mut(PIXELS).zip(self.rows.chunks_exact(rank)) {
+            for (products, &z) in products.chunks_exact(PIXELS).zip(row) {
+                let z = f32::from(z);
+                values
+                    .iter_mut()
+                    .zip(products)
+                    .for_each(|(value, p)| *value += z * p);
+            }
+            values.iter_mut().for_each(|value| *value = value.max(0.0));
+        }
+        values
     }
 }
 

@@ -169,7 +169,8 @@ impl Level {
         self.first + row * self.axes[0].kept + column
     }
 
-    fn images(&self) -> u32 {
+    /// Images of the level.
+    pub fn images(&self) -> u32 {
         self.axes[0].kept * self.axes[1].kept
     }
 
