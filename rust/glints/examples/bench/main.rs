@@ -16,6 +16,7 @@
 //! * `direct_gaussian/eval`, `/sample` the direct sum under a Gaussian of half a pixel, against the box's.
 //! * `*/ndf_error` relative L1 distance to the direct sum, where that takes no more than [`cost::LARGEST_DIRECT`] texels;
 //!   larger footprints have no such row.
+//! * `tensor/...` see the module `tensor`; with `--methods tensor`, alone.
 //! * `*/eval/worst`, `/median`, `/worst_over_best`, `*/ndf_error/worst` over all cells (roughness and footprint) of the map;
 //!   `params` names the cell that is worst, and of how many.
 
@@ -23,6 +24,7 @@ mod cost;
 mod error;
 mod memory;
 mod report;
+mod tensor;
 
 use std::path::PathBuf;
 
@@ -61,9 +63,15 @@ struct Arguments {
     /// Footprints in texels: the width of a square, or length x thickness.
     #[arg(long, value_delimiter = ',', default_value = FOOTPRINTS)]
     footprint: Vec<Cell>,
-    /// Methods to measure, besides the direct sum: ibm, yan16.
+    /// Methods to measure, besides the direct sum: ibm, yan16; or tensor, alone.
     #[arg(long, value_delimiter = ',', default_values_t = ["ibm".to_string(), "yan16".to_string()])]
     methods: Vec<String>,
+    /// Ranks of the tensor decomposition; costs are measured with the last.
+    #[arg(long, value_delimiter = ',', default_values_t = [16])]
+    ranks: Vec<u32>,
+    /// Tensor decomposition with the published solver.
+    #[arg(long)]
+    published: bool,
     /// Sides in texels of further maps whose memory is counted: the given one cropped or tiled.
     #[arg(long, value_delimiter = ',')]
     sides: Vec<u32>,
@@ -81,6 +89,9 @@ const BUILDS: usize = 5;
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
     let map = NormalMap::load(&arguments.map, Encoding::Automatic, false)?;
+    if arguments.methods.iter().any(|name| name == "tensor") {
+        return tensor::measure(&arguments, &map);
+    }
     let mut summaries = [Summary::new("ibm"), Summary::new("ibm_paper")];
     let params = json!({ "map": arguments.label, "side": map.width() });
     for &alpha in &arguments.alpha {
