@@ -75,7 +75,7 @@ pub struct Options {
     pub rank: usize,
     /// Relative error `|T - T'| / |T|` at which to stop.
     pub tolerance: f64,
-    /// Most sweeps.
+    /// Most sweeps from one start.
     pub max_iterations: usize,
     /// Weight of the components' squared norms against the squared error, at least 1e-8.
     pub ridge: f64,
@@ -88,7 +88,9 @@ pub struct Options {
     /// Relative error, lower than `tolerance`, up to which the third mode is compressed during the sweeps; 0: not at all.
     /// The last Z is that of the full tensor.
     pub compression: f64,
-    /// Seed of the random start.
+    /// Random starts, of which the one that the first stages have led furthest is continued; at least one.
+    pub starts: usize,
+    /// Seed of the random starts.
     pub seed: u64,
 }
 
@@ -104,6 +106,7 @@ impl Options {
             accelerated: false,
             stall: 0.0,
             compression: 0.0,
+            starts: 1,
             seed: 0,
         }
     }
@@ -121,6 +124,7 @@ impl Default for Options {
             accelerated: true,
             stall: 1e-3,
             compression: 7e-4,
+            starts: 2,
             seed: 0,
         }
     }
@@ -137,6 +141,7 @@ pub struct Decomposition {
     pub relative_error: f64,
     /// Root of the sum of the components' squared norms over the tensor's norm. Large: components cancel each other.
     pub condition: f64,
+    /// Sweeps from the start that was continued; an extrapolation that failed counts as one.
     pub iterations: usize,
 }
 
@@ -277,8 +282,26 @@ struct Fit {
 /// Where some sweeps have led.
 struct Descent {
     state: State,
+    objective: f64,
     squared_error: f64,
     sweeps: usize,
+}
+
+impl Descent {
+    /// No sweep yet.
+    fn from(state: State) -> Self {
+        let (objective, squared_error) = (f64::INFINITY, f64::INFINITY);
+        Self {
+            state,
+            objective,
+            squared_error,
+            sweeps: 0,
+        }
+    }
+
+    fn is_within(&self, tolerance: f64) -> bool {
+        self.squared_error <= tolerance * tolerance
+    }
 }
 
 /// X and Y, one behind the other: what a sweep starts from.
@@ -328,24 +351,20 @@ impl<'a> Solver<'a> {
     }
 
     fn run(&self) -> Decomposition {
-        let Options {
-            max_iterations,
-            stages,
-            ..
-        } = *self.options;
         let last_ridge = self.options.ridge.max(MIN_RIDGE);
-        let mut state = start(self.tensor, self.options);
-        let mut iterations = 0;
-        for stage in (0..=stages).rev() {
-            let sweeps = if stage == 0 { max_iterations } else { STAGE }.min(max_iterations - iterations);
-            let ridge = last_ridge * 10.0_f64.powi(stage as i32);
-            let descent = self.descend(state, ridge, sweeps);
-            state = descent.state;
-            iterations += descent.sweeps;
-            if descent.squared_error <= self.options.tolerance.powi(2) {
-                break;
-            }
-        }
+        let starts = (0..self.options.starts.max(1)).map(|number| self.first_stages(number, last_ridge));
+        let first = starts
+            .min_by(|a, b| a.objective.total_cmp(&b.objective))
+            .expect("at least one start");
+        let rest = self.options.max_iterations.saturating_sub(first.sweeps);
+        let sweeps = if first.is_within(self.options.tolerance) {
+            0
+        } else {
+            rest
+        };
+        let last = self.descend(first.state, last_ridge, sweeps);
+        let iterations = first.sweeps + last.sweeps;
+        let state = last.state;
         let [x, y] = self.factors(&state);
         let scaled = scaled(self.tensor, self.norm, &self.places);
         let slices = Panels::new(self.tensor.dims[2], self.places.len(), &scaled);
@@ -364,15 +383,28 @@ impl<'a> Solver<'a> {
         }
     }
 
+    /// The stages with larger ridges, from one of the starts.
+    fn first_stages(&self, number: usize, last_ridge: f64) -> Descent {
+        let mut descent = Descent::from(start(self.tensor, self.options, number));
+        for stage in (1..=self.options.stages).rev() {
+            let sweeps = STAGE.min(self.options.max_iterations - descent.sweeps);
+            let next = self.descend(descent.state, last_ridge * 10.0_f64.powi(stage as i32), sweeps);
+            descent = Descent {
+                sweeps: descent.sweeps + next.sweeps,
+                ..next
+            };
+            if descent.is_within(self.options.tolerance) {
+                break;
+            }
+        }
+        descent
+    }
+
     /// Sweeps until the tolerance is reached or the objective stalls.
     fn descend(&self, mut state: State, ridge: f64, max_sweeps: usize) -> Descent {
         let mut acceleration = Acceleration::default();
         let mut objectives: Vec<f64> = Vec::new();
-        let mut best = Descent {
-            state: state.clone(),
-            squared_error: f64::INFINITY,
-            sweeps: 0,
-        };
+        let mut best = Descent::from(state.clone());
         for sweeps in 1..=max_sweeps {
             let [x, y] = self.factors(&state);
             let (z, products) = self.solve_z(&self.slices, &x, &y, ridge);
@@ -383,9 +415,10 @@ impl<'a> Solver<'a> {
                 continue;
             }
             objectives.push(fit.objective);
+            best.objective = fit.objective;
             best.squared_error = fit.squared_error;
             best.state = state;
-            if fit.squared_error <= self.options.tolerance.powi(2) || self.is_stalled(&objectives) {
+            if best.is_within(self.options.tolerance) || self.is_stalled(&objectives) {
                 break;
             }
             let swept = self.sweep(&y, &z, ridge);
@@ -559,10 +592,10 @@ fn dot(a: &[f32x8], b: &[f32x8]) -> f64 {
 }
 
 /// X and Y to start from: random numbers in [0, 1), as the values are mostly positive.
-fn start(tensor: &Tensor, options: &Options) -> State {
+fn start(tensor: &Tensor, options: &Options, number: usize) -> State {
     let value = |mode: usize, row: usize, component: usize| {
         if component < options.rank {
-            random(options.seed, [mode, row, component])
+            random(options.seed, [mode + 2 * number, row, component])
         } else {
             0.0
         }
