@@ -1,9 +1,10 @@
 //! The sum over flakes of Eq. 11 (Atanasov et al. 2021), term by term: shared by every method that represents
 //! the footprint by weighted normals.
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use crate::half_vector::DirectionPair;
+use crate::lobe_range::lobe_integral;
 use crate::methods::Reflection;
 use crate::microfacet::Flake;
 
@@ -52,6 +53,11 @@ impl FlakeModel {
     #[inline]
     pub fn ndf(&self, h: Vec3, t: Vec3, weight: f32) -> f32 {
         self.share(weight, t) * self.flake.distribution(h, t).0
+    }
+
+    /// The term of the integral of [`FlakeModel::ndf`] over a rectangle of the projected disk.
+    pub fn ndf_integral(&self, t: Vec3, weight: f32, low: Vec2, high: Vec2) -> f64 {
+        f64::from(self.share(weight, t)) * lobe_integral(&self.flake, t, low, high)
     }
 
     /// The term of the half vector's density.

@@ -22,6 +22,7 @@ pub mod gaussian_footprint;
 pub mod gtr;
 pub mod half_vector;
 mod hash;
+pub mod lobe_range;
 pub mod methods;
 pub mod microfacet;
 pub mod mip_map;

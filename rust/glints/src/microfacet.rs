@@ -73,7 +73,12 @@ impl Flake {
     /// single-precision cosine is a percent of the exponent.
     #[inline]
     pub fn distribution(&self, h: Vec3, t: Vec3) -> (f32, f32) {
-        let chord2 = (h - t).length_squared();
+        self.distribution_at_chord2((h - t).length_squared())
+    }
+
+    /// The same as a function of the squared chord `|h - t|^2`.
+    #[inline]
+    pub fn distribution_at_chord2(&self, chord2: f32) -> (f32, f32) {
         if chord2 >= self.max_chord2 {
             return (0.0, 0.0);
         }

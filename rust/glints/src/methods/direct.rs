@@ -10,9 +10,9 @@
 //! half a pixel reaches 14 times as many as the box, and at most about two hundred periods. Weights are computed
 //! where a lobe reaches the half vector only. `sample` costs O(1).
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
-use super::{Method, Reflection};
+use super::{Method, Reflection, mean_over};
 use crate::flakes::FlakeModel;
 use crate::footprint::Footprint;
 use crate::footprint_filter::{FilteredPart, FootprintFilter, Window};
@@ -135,6 +135,19 @@ impl Method for Direct {
         self.sum(footprint, h, |t, weight| self.model.ndf(h, t, weight))
     }
 
+    fn ndf_over(&self, footprint: &Footprint, low: Vec2, high: Vec2) -> Option<f32> {
+        Some(mean_over(low, high, || {
+            let mut sum = 0.0;
+            self.for_each_block(footprint, |normals, weight| {
+                let terms = normals
+                    .iter()
+                    .map(|&t| self.model.ndf_integral(t, weight, low, high));
+                sum += terms.sum::<f64>();
+            });
+            sum
+        }))
+    }
+
     fn sample(&self, footprint: &Footprint, u: [f32; 4]) -> Option<Vec3> {
         let (column, row) = self
             .filter
@@ -153,5 +166,79 @@ impl Method for Direct {
 
     fn name(&self) -> &'static str {
         "direct"
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flakes::Normalization;
+    use crate::methods::unfiltered::{Interpolation, Unfiltered};
+    use crate::microfacet::{Distribution, Flake};
+    use approx::assert_relative_eq;
+    use glam::DVec2;
+
+    fn tilted_map() -> NormalMap {
+        let normal = |i: u32| {
+            let angle = i as f32;
+            Vec3::new(0.3 * (angle * 2.4).sin(), 0.3 * (angle * 1.7).cos(), 1.0).normalize()
+        };
+        let normals: Vec<Vec3> = (0..24 * 16).map(normal).collect();
+        NormalMap::from_normals("tilted", 24, 16, &normals).unwrap()
+    }
+
+    /// The mean of `ndf` over the midpoints of 400 x 400 cells; points outside the disk count as zero.
+    fn averaged(method: &dyn Method, footprint: &Footprint, low: Vec2, high: Vec2) -> f64 {
+        const SIDE: usize = 400;
+        let value = |i: usize| {
+            let cell = Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5) / SIDE as f32;
+            let p = low + cell * (high - low);
+            let z2 = 1.0 - p.length_squared();
+            if z2 > 0.0 {
+                f64::from(method.ndf(footprint, p.extend(z2.sqrt())))
+            } else {
+                0.0
+            }
+        };
+        (0..SIDE * SIDE).map(value).sum::<f64>() / (SIDE * SIDE) as f64
+    }
+
+    #[test]
+    fn ranges_are_averages_of_points() {
+        for (kind, normalization) in [
+            (Distribution::Beckmann, Normalization::Projected),
+            (Distribution::Beckmann, Normalization::Paper),
+            (Distribution::Ggx, Normalization::Projected),
+        ] {
+            let model = FlakeModel {
+                flake: Flake::new(kind, 0.08).unwrap(),
+                normalization,
+            };
+            let direct = Direct::new(tilted_map(), model);
+            let unfiltered = Unfiltered::new(tilted_map(), model, Interpolation::Nearest);
+            let footprint = |width: f64| {
+                let (a, b) = (DVec2::new(width, 0.4), DVec2::new(-0.3, width));
+                Footprint::in_texels(24, 16, DVec2::new(7.2, 5.1), a, b)
+            };
+            for (method, width) in [(&direct as &dyn Method, 5.0), (&direct, 40.0), (&unfiltered, 0.0)] {
+                for (low, high) in [
+                    (Vec2::new(-0.1, -0.05), Vec2::new(0.25, 0.3)),
+                    (Vec2::new(-0.35, 0.1), Vec2::new(-0.3, 0.9)),
+                    (Vec2::new(-1.0, -1.0), Vec2::new(1.0, 1.0)),
+                    (Vec2::new(-0.02, -0.2), Vec2::new(1.3, 0.4)),
+                ] {
+                    let mean = method.ndf_over(&footprint(width), low, high).unwrap();
+                    let expected = averaged(method, &footprint(width), low, high);
+                    assert_relative_eq!(f64::from(mean), expected, max_relative = 2e-3, epsilon = 1e-4);
+                }
+            }
+            // Twin: the density at the centre instead of the mean.
+            let (low, high) = (Vec2::new(-0.1, -0.05), Vec2::new(0.25, 0.3));
+            let center = 0.5 * (low + high);
+            let h = center.extend((1.0 - center.length_squared()).sqrt());
+            let expected = averaged(&direct, &footprint(5.0), low, high);
+            assert!((f64::from(direct.ndf(&footprint(5.0), h)) / expected - 1.0).abs() > 0.1);
+            assert_eq!(direct.ndf_over(&footprint(5.0), high, low), Some(0.0));
+        }
     }
 }

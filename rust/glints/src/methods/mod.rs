@@ -83,3 +83,13 @@ pub struct Reflection {
     /// Density of the half vector, per solid angle.
     pub density: f32,
 }
+
+/// A mean over a rectangle from the integral over it; zero without area, as [`Method::ndf_over`] answers.
+pub(crate) fn mean_over(low: Vec2, high: Vec2, integral: impl FnOnce() -> f64) -> f32 {
+    let extent = (high - low).as_dvec2();
+    if low.cmplt(high).all() {
+        (integral() / (extent.x * extent.y)) as f32
+    } else {
+        0.0
+    }
+}

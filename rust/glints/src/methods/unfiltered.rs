@@ -11,9 +11,9 @@
 //!
 //! **Cost** One texel a query; four of an interpolated map.
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
-use super::{Method, Reflection};
+use super::{Method, Reflection, mean_over};
 use crate::flakes::FlakeModel;
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
@@ -67,6 +67,11 @@ impl Method for Unfiltered {
 
     fn ndf(&self, footprint: &Footprint, h: Vec3) -> f32 {
         self.model.ndf(h, self.normal(footprint), 1.0)
+    }
+
+    fn ndf_over(&self, footprint: &Footprint, low: Vec2, high: Vec2) -> Option<f32> {
+        let integral = || self.model.ndf_integral(self.normal(footprint), 1.0, low, high);
+        Some(mean_over(low, high, integral))
     }
 
     fn sample(&self, footprint: &Footprint, u: [f32; 4]) -> Option<Vec3> {
