@@ -124,6 +124,8 @@ rust::Str utf8(const std::string &filename, const char *parameter = "filename") 
     }
 }
 
+rust::Slice<const float> slice(const std::vector<float> &values) { return {values.data(), values.size()}; }
+
 // Calls a constructor of the bridge; its errors become ours, with the same text.
 template <typename Construct>
 auto translated(Construct construct) {
@@ -156,15 +158,58 @@ NormalMap NormalMap::load(const std::string &filename, Encoding encoding, bool f
 NormalMap NormalMap::from_normals(const std::string &name, uint32_t width, uint32_t height,
                                   const std::vector<float> &xyz) {
     return translated([&] {
-        rust::Slice<const float> components(xyz.data(), xyz.size());
         return NormalMap(
-            std::make_unique<Impl>(Impl{bridge::map_from_normals(utf8(name), width, height, components)}));
+            std::make_unique<Impl>(Impl{bridge::map_from_normals(utf8(name), width, height, slice(xyz))}));
     });
 }
 
 uint32_t NormalMap::width() const { return m_impl->map->width(); }
 uint32_t NormalMap::height() const { return m_impl->map->height(); }
 Vec3 NormalMap::normal(int64_t column, int64_t row) const { return from_bridge(m_impl->map->normal(column, row)); }
+
+// ---- Environment -------------------------------------------------------------------------------------------------------------
+
+struct Environment::Impl {
+    rust::Box<bridge::Environment> environment;
+};
+
+Environment::Environment(std::unique_ptr<Impl> impl) : m_impl(std::move(impl)) {}
+Environment::Environment(Environment &&) noexcept = default;
+Environment &Environment::operator=(Environment &&) noexcept = default;
+Environment::~Environment() = default;
+
+Environment Environment::fit(const std::vector<float> &directions, const std::vector<float> &weights, uint32_t lobes,
+                             float epsilon, uint64_t seed) {
+    return translated([&] {
+        return Environment(std::make_unique<Impl>(
+            Impl{bridge::environment(slice(directions), slice(weights), lobes, epsilon, seed)}));
+    });
+}
+
+uint32_t Environment::lobe_count() const noexcept { return m_impl->environment->lobe_count(); }
+
+Lobe Environment::lobe(uint32_t index) const noexcept {
+    auto lobe = m_impl->environment->lobe(index);
+    return {from_bridge(lobe.axis), lobe.sharpness, lobe.weight};
+}
+
+float Environment::density(const Vec3 &direction) const noexcept {
+    return m_impl->environment->density(to_bridge(direction));
+}
+
+std::vector<float> Environment::energies(const std::vector<float> &directions, const std::vector<float> &values,
+                                         uint32_t channels) const {
+    return translated([&] {
+        auto energies = m_impl->environment->energies(slice(directions), slice(values), channels);
+        return std::vector<float>(energies.begin(), energies.end());
+    });
+}
+
+double Environment::residual(const std::vector<float> &directions, const std::vector<float> &weights,
+                             const std::vector<float> &radiances) const {
+    return translated(
+        [&] { return m_impl->environment->residual(slice(directions), slice(weights), slice(radiances)); });
+}
 
 // ---- Brdf --------------------------------------------------------------------------------------------------------------------
 
@@ -269,6 +314,22 @@ Sample Brdf::sample(const Footprint &footprint, const Vec3 &wi, float u1, float 
 
 float Brdf::ndf(const Footprint &footprint, const Vec3 &h) const noexcept {
     return m_impl->brdf->ndf(to_bridge(footprint), to_bridge(h));
+}
+
+std::optional<float> Brdf::ndf_over(const Footprint &footprint, float low_x, float low_y, float high_x,
+                                    float high_y) const noexcept {
+    auto range = m_impl->brdf->ndf_over(to_bridge(footprint), {low_x, low_y}, {high_x, high_y});
+    return range.known ? std::optional<float>(range.mean) : std::nullopt;
+}
+
+bool Brdf::prefilters() const noexcept { return m_impl->brdf->prefilters(); }
+
+LobeSample Brdf::sample_environment(const Footprint &footprint, const Vec3 &wi, const Vec3 &x, const Vec3 &y,
+                                    const Vec3 &z, const Environment &environment, float u1, float u2,
+                                    float u3) const noexcept {
+    auto s = m_impl->brdf->sample_lobe(to_bridge(footprint), to_bridge(wi), {to_bridge(x), to_bridge(y), to_bridge(z)},
+                                       *environment.m_impl->environment, {u1, u2, u3});
+    return {s.lobe, s.probability, from_bridge(s.wo), s.value, s.valid};
 }
 
 Statistics Brdf::statistics() const { return from_bridge(m_impl->brdf->statistics()); }

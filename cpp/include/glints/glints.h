@@ -20,6 +20,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -213,6 +214,56 @@ struct Statistics {
     std::string warning;                    ///< what users should know about their input; empty: nothing
 };
 
+/// A spherical Gaussian exp(sharpness (dot(x, axis) - 1)), normalised to integral one, with its share of the light.
+struct Lobe {
+    Vec3 axis;
+    float sharpness, weight;
+};
+
+/// The light of an environment as a mixture of spherical Gaussians, for `Brdf::sample_environment` (Deng et al. 2022,
+/// Section 5.4). In any one coordinate system, the host's.
+class GLINTS_API Environment {
+public:
+    /// Fits at most `lobes` lobes to light from the unit vectors `directions`, three numbers each. `weights`: radiance
+    /// times the solid angle that a direction stands for. `epsilon`, in (0, 1): a lobe's light counts as coming from
+    /// where it is above so many times its peak. Deterministic.
+    static Environment fit(const std::vector<float> &directions, const std::vector<float> &weights, uint32_t lobes,
+                           float epsilon = 0.3f, uint64_t seed = 0);
+
+    uint32_t lobe_count() const noexcept;
+    Lobe lobe(uint32_t index) const noexcept;
+    /// Density of the light, normalised to one, per solid angle.
+    float density(const Vec3 &direction) const noexcept;
+    /// Splits light of any `channels` (colours, wavelengths) among the lobes, lobe by lobe: `values` has `channels`
+    /// numbers for each direction, radiance times solid angle. Sums are kept.
+    std::vector<float> energies(const std::vector<float> &directions, const std::vector<float> &values,
+                                uint32_t channels) const;
+    /// The share of the light that the mixture has elsewhere, in [0, 1]. `weights` are those of the fit, `radiances` the
+    /// light per solid angle in the same unit.
+    double residual(const std::vector<float> &directions, const std::vector<float> &weights,
+                    const std::vector<float> &radiances) const;
+
+    struct Impl;
+    Environment(Environment &&) noexcept;
+    Environment &operator=(Environment &&) noexcept;
+    ~Environment();
+
+private:
+    explicit Environment(std::unique_ptr<Impl>);
+    std::unique_ptr<Impl> m_impl;
+    friend class Brdf;
+};
+
+/// A lobe of an environment that a BRDF has drawn. An estimate of the reflected light is the lobe's energy times
+/// `value / probability`, Fresnel term, colour and visibility along `wo`.
+struct LobeSample {
+    uint32_t lobe;
+    float probability;
+    Vec3 wo;     ///< a direction from the lobe, in the local frame
+    float value; ///< f * cos(theta_o), averaged over the lobe
+    bool valid;  ///< false: nothing was drawn; counts as zero
+};
+
 /// A normal map filtered over footprints by one of the methods.
 class GLINTS_API Brdf {
 public:
@@ -255,6 +306,17 @@ public:
     Sample sample(const Footprint &footprint, const Vec3 &wi, float u1, float u2, float u3) const noexcept;
     /// The filtered distribution of normals D_A at the unit half vector `h`, per solid angle.
     float ndf(const Footprint &footprint, const Vec3 &h) const noexcept;
+    /// The mean of `ndf` over a rectangle of the projected disk, in x and y of half vectors; outside the disk it counts
+    /// as zero. Nothing: the method cannot.
+    std::optional<float> ndf_over(const Footprint &footprint, float low_x, float low_y, float high_x,
+                                  float high_y) const noexcept;
+    /// Does the method answer `ndf_over`, and `sample_environment` with it?
+    bool prefilters() const noexcept;
+    /// Draws a lobe of the environment's light. `x`, `y`, `z`: the local frame in the environment's coordinates. `u1`
+    /// chooses the lobe, `u2`, `u3` a direction from it; independent and uniform on [0, 1).
+    LobeSample sample_environment(const Footprint &footprint, const Vec3 &wi, const Vec3 &x, const Vec3 &y,
+                                  const Vec3 &z, const Environment &environment, float u1, float u2,
+                                  float u3) const noexcept;
 
     Statistics statistics() const;
 

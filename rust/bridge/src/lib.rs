@@ -13,7 +13,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::time::Instant;
 
-use glam::Vec3;
+use glam::{Mat3, Vec2, Vec3};
 use glints::brdf::{Brdf as Core, Masking};
 use glints::error::{Error, Result};
 use glints::flake_layer::{self, LayerMasking};
@@ -30,8 +30,10 @@ use glints::methods::yan16::{self, Elements, Yan16};
 use glints::microfacet::{Distribution, Flake};
 use glints::mip_map::MipMap;
 use glints::normal_map::{Encoding, NormalMap};
+use glints::prefilter::{self, Prefilter};
 use glints::refinement::Refinement;
 use glints::saved::{self, Flakes, SavedMap};
+use glints::spherical_gaussians::{Light, SphericalGaussians};
 
 #[cxx::bridge(namespace = "glints::bridge")]
 mod ffi {
@@ -182,6 +184,31 @@ mod ffi {
         wo: Vector,
     }
 
+    /// The mean of a distribution over a rectangle; `known` is false where a method cannot tell.
+    #[derive(Clone, Copy)]
+    struct RangeMean {
+        known: bool,
+        mean: f32,
+    }
+
+    /// A spherical Gaussian with its share of the environment's light.
+    #[derive(Clone, Copy)]
+    struct Lobe {
+        axis: Vector,
+        sharpness: f32,
+        weight: f32,
+    }
+
+    /// A lobe of an environment, drawn by a BRDF; `value` is averaged over the lobe.
+    #[derive(Clone, Copy)]
+    struct LobeSample {
+        lobe: u32,
+        probability: f32,
+        wo: Vector,
+        value: f32,
+        valid: bool,
+    }
+
     struct Statistics {
         method: String,
         width: u32,
@@ -242,7 +269,44 @@ mod ffi {
         fn pdf(self: &Brdf, footprint: Footprint, wi: Vector, wo: Vector) -> f32;
         fn sample(self: &Brdf, footprint: Footprint, wi: Vector, u: [f32; 3]) -> Sample;
         fn ndf(self: &Brdf, footprint: Footprint, h: Vector) -> f32;
+        fn ndf_over(self: &Brdf, footprint: Footprint, low: [f32; 2], high: [f32; 2]) -> RangeMean;
+        fn prefilters(self: &Brdf) -> bool;
+        /// `axes`: the local frame's x, y and z in the environment's coordinates.
+        fn sample_lobe(
+            self: &Brdf,
+            footprint: Footprint,
+            wi: Vector,
+            axes: [Vector; 3],
+            environment: &Environment,
+            u: [f32; 3],
+        ) -> LobeSample;
         fn statistics(self: &Brdf) -> Statistics;
+
+        type Environment;
+        /// Three components for each direction, one weight.
+        fn environment(
+            directions: &[f32],
+            weights: &[f32],
+            lobes: u32,
+            epsilon: f32,
+            seed: u64,
+        ) -> Result<Box<Environment>>;
+        fn lobe_count(self: &Environment) -> u32;
+        fn lobe(self: &Environment, index: u32) -> Lobe;
+        fn density(self: &Environment, direction: Vector) -> f32;
+        /// `channels` values for each direction, lobe by lobe in the answer.
+        fn energies(
+            self: &Environment,
+            directions: &[f32],
+            values: &[f32],
+            channels: u32,
+        ) -> Result<Vec<f32>>;
+        fn residual(
+            self: &Environment,
+            directions: &[f32],
+            weights: &[f32],
+            radiances: &[f32],
+        ) -> Result<f64>;
 
         type FlakeLayer;
         /// `mask` names a file; empty: every texel holds a flake.
@@ -311,6 +375,8 @@ pub struct Brdf {
     /// Columns and rows of the map; without it, those of the structure.
     map: (u32, u32),
     surface: ffi::Surface,
+    /// For methods that answer range queries.
+    prefilter: Option<Prefilter>,
     build_seconds: f64,
     refinement: Option<Refinement>,
 }
@@ -365,10 +431,7 @@ fn saved_structure(filename: &str) -> Result<ffi::SavedStructure> {
         Ok(ffi::SavedStructure {
             width: header.map.0,
             height: header.map.1,
-            distribution: match header.distribution {
-                Distribution::Beckmann => ffi::FlakeDistribution::Beckmann,
-                Distribution::Ggx => ffi::FlakeDistribution::Ggx,
-            },
+            distribution: distribution_to_ffi(header.distribution),
             alpha: header.alpha,
             projected: header.normalization == Normalization::Projected,
         })
@@ -402,6 +465,8 @@ fn load(filename: &str, surface: ffi::Surface, map: Option<&NormalMap>) -> Resul
             core,
             map: size,
             surface,
+            // A bin map has no range query.
+            prefilter: None,
             build_seconds: start.elapsed().as_secs_f64(),
             refinement,
         }))
@@ -579,8 +644,12 @@ fn tensor(map: &Map, surface: ffi::Surface, options: ffi::TensorOptions, cache: 
 fn tensor_from_file(filename: &str, surface: ffi::Surface) -> Result<Box<Brdf>> {
     let start = Instant::now();
     let (tensor, map) = guarded("ndf_file", filename, || Tensor::load(Path::new(filename)))?;
-    let alpha = tensor.model().flake.alpha();
-    let surface = ffi::Surface { alpha, ..surface };
+    let flake = tensor.model().flake;
+    let surface = ffi::Surface {
+        alpha: flake.alpha(),
+        distribution: distribution_to_ffi(flake.kind()),
+        ..surface
+    };
     let mut brdf = build(&Map(map), surface, AS_IT_IS, |_| Ok(Box::new(tensor)))?;
     brdf.build_seconds = start.elapsed().as_secs_f64();
     Ok(brdf)
@@ -597,6 +666,13 @@ fn distribution(surface: ffi::Surface) -> Distribution {
     match surface.distribution {
         ffi::FlakeDistribution::Ggx => Distribution::Ggx,
         _ => Distribution::Beckmann,
+    }
+}
+
+fn distribution_to_ffi(distribution: Distribution) -> ffi::FlakeDistribution {
+    match distribution {
+        Distribution::Beckmann => ffi::FlakeDistribution::Beckmann,
+        Distribution::Ggx => ffi::FlakeDistribution::Ggx,
     }
 }
 
@@ -653,6 +729,7 @@ fn build(
             method
         })?;
         Ok(Box::new(Brdf {
+            prefilter: prefilter(&map.0, surface, &core)?,
             core,
             map: (map.width(), map.height()),
             surface,
@@ -671,6 +748,16 @@ fn masking(surface: ffi::Surface) -> Masking {
         },
         _ => Masking::None,
     }
+}
+
+/// A mirror has no range query, whatever its method.
+fn prefilter(map: &NormalMap, surface: ffi::Surface, core: &Core) -> Result<Option<Prefilter>> {
+    let point = core.footprint([0.0; 2], [0.0; 2], [0.0; 2]);
+    let answers = core.ndf_over(&point, Vec2::ZERO, Vec2::splat(1e-3)).is_some();
+    if !answers || surface.alpha == 0.0 {
+        return Ok(None);
+    }
+    Ok(Some(Prefilter::new(map, flakes(surface)?.flake)))
 }
 
 impl Brdf {
@@ -711,6 +798,50 @@ impl Brdf {
         self.core.ndf(&self.footprint(footprint), from_ffi(h))
     }
 
+    fn ndf_over(&self, footprint: ffi::Footprint, low: [f32; 2], high: [f32; 2]) -> ffi::RangeMean {
+        let footprint = self.footprint(footprint);
+        let mean = self.core.ndf_over(&footprint, low.into(), high.into());
+        ffi::RangeMean {
+            known: mean.is_some(),
+            mean: mean.unwrap_or(0.0),
+        }
+    }
+
+    fn prefilters(&self) -> bool {
+        self.prefilter.is_some()
+    }
+
+    fn sample_lobe(
+        &self,
+        footprint: ffi::Footprint,
+        wi: ffi::Vector,
+        axes: [ffi::Vector; 3],
+        environment: &Environment,
+        u: [f32; 3],
+    ) -> ffi::LobeSample {
+        let to_local = Mat3::from_cols_array_2d(&axes.map(|axis| from_ffi(axis).to_array())).transpose();
+        let footprint = self.footprint(footprint);
+        let draw = |prefilter: &Prefilter| {
+            prefilter.sample(&self.core, &footprint, from_ffi(wi), &to_local, &environment.0, u)
+        };
+        self.prefilter.as_ref().and_then(draw).map_or(
+            ffi::LobeSample {
+                lobe: 0,
+                probability: 0.0,
+                wo: to_ffi(Vec3::ZERO),
+                value: 0.0,
+                valid: false,
+            },
+            |s| ffi::LobeSample {
+                lobe: s.lobe as u32,
+                probability: s.probability,
+                wo: to_ffi(s.wo),
+                value: s.value,
+                valid: true,
+            },
+        )
+    }
+
     fn statistics(&self) -> ffi::Statistics {
         let (masking_alpha_u, masking_alpha_v) = self.core.masking_alphas();
         let method = self.core.method();
@@ -737,6 +868,75 @@ impl Brdf {
     fn footprint(&self, f: ffi::Footprint) -> glints::footprint::Footprint {
         self.core.footprint(f.uv, f.duv_dx, f.duv_dy)
     }
+}
+
+// ---- environments ---------------------------------------------------------------------------------------------------------------
+
+/// A mixture of spherical Gaussians with the supports of its lobes.
+pub struct Environment(prefilter::Environment);
+
+fn environment(
+    directions: &[f32],
+    weights: &[f32],
+    lobes: u32,
+    epsilon: f32,
+    seed: u64,
+) -> Result<Box<Environment>> {
+    guarded("lobes", &lobes.to_string(), || {
+        let directions = vectors(directions);
+        let light = Light {
+            directions: &directions,
+            weights,
+        };
+        let mixture = SphericalGaussians::fit(light, lobes as usize, seed)?;
+        Ok(Box::new(Environment(prefilter::Environment::new(
+            mixture, epsilon,
+        )?)))
+    })
+}
+
+impl Environment {
+    fn lobe_count(&self) -> u32 {
+        self.0.mixture().lobes().len() as u32
+    }
+
+    fn lobe(&self, index: u32) -> ffi::Lobe {
+        let (lobes, weights) = (self.0.mixture().lobes(), self.0.mixture().weights());
+        let index = (index as usize).min(lobes.len() - 1);
+        ffi::Lobe {
+            axis: to_ffi(lobes[index].axis),
+            sharpness: lobes[index].sharpness,
+            weight: weights[index],
+        }
+    }
+
+    fn density(&self, direction: ffi::Vector) -> f32 {
+        self.0.mixture().density(from_ffi(direction))
+    }
+
+    fn energies(&self, directions: &[f32], values: &[f32], channels: u32) -> Result<Vec<f32>> {
+        guarded("channels", &channels.to_string(), || {
+            let energies = self
+                .0
+                .mixture()
+                .energies(&vectors(directions), values, channels as usize);
+            Ok(energies.into_iter().map(|energy| energy as f32).collect())
+        })
+    }
+
+    fn residual(&self, directions: &[f32], weights: &[f32], radiances: &[f32]) -> Result<f64> {
+        guarded("directions", "", || {
+            let light = Light {
+                directions: &vectors(directions),
+                weights,
+            };
+            Ok(self.0.mixture().residual(light, radiances))
+        })
+    }
+}
+
+fn vectors(components: &[f32]) -> Vec<Vec3> {
+    components.chunks_exact(3).map(Vec3::from_slice).collect()
 }
 
 // ---- layers of flakes -------------------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@
 //! 1`, where `i` points to the viewer (`wi`) and `o` to the light (`wo`); the density of `wo` is that of the
 //! half vector over `4 (o . h)`.
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use crate::error::{Error, Result};
 use crate::footprint::Footprint;
@@ -160,6 +160,11 @@ impl Brdf {
         }
     }
 
+    /// [`Method::ndf_over`].
+    pub fn ndf_over(&self, footprint: &Footprint, low: Vec2, high: Vec2) -> Option<f32> {
+        self.method.ndf_over(footprint, low, high)
+    }
+
     /// Draws `wo` from three independent uniform numbers; `None` if the draw failed, which counts as zero.
     pub fn sample(&self, footprint: &Footprint, wi: Vec3, u: [f32; 3]) -> Option<Sample> {
         if wi.z <= 0.0 {
@@ -176,14 +181,18 @@ impl Brdf {
         })
     }
 
+    /// `G_x` of the whole map.
+    pub(crate) fn masking(&self, pair: &DirectionPair) -> f32 {
+        self.masking.g1(pair.wi) * self.masking.g1(pair.wo)
+    }
+
     fn evaluate_pair(&self, footprint: &Footprint, pair: &DirectionPair) -> Evaluation {
         let reflection = self.method.evaluate(footprint, pair);
         if reflection.density == 0.0 {
             return Evaluation::default();
         }
-        let masking = self.masking.g1(pair.wi) * self.masking.g1(pair.wo);
         Evaluation {
-            value: masking * reflection.value / (4.0 * pair.wi.z),
+            value: self.masking(pair) * reflection.value / (4.0 * pair.wi.z),
             pdf: reflection.density / (4.0 * pair.cos),
         }
     }
