@@ -208,7 +208,7 @@ def test_zero_switches_filtering_off(make_map):
     assert not lines
 
 
-def test_deeper_vertices_have_no_footprint():
+def test_deeper_vertices_have_no_footprint_when_that_is_switched_off():
     """Seen in a mirror: the camera looks up into it from beside the plane's pixel grid, and it reflects the plane."""
     mirror = {
         "type": "rectangle",
@@ -220,7 +220,8 @@ def test_deeper_vertices_have_no_footprint():
         "to_world": mi.ScalarTransform4f().translate((0, 0, 4)).rotate((1, 0, 0), 180),
         "bsdf": {"type": "footprint_recorder"},
     }
-    assert_squares(footprints({"footprint": "pixel"}, mirror=mirror, ceiling=ceiling), 0.0, 4 * RESOLUTION**2)
+    off = {"footprint": "pixel", "indirect_footprint": 0}
+    assert_squares(footprints(off, mirror=mirror, ceiling=ceiling), 0.0, 4 * RESOLUTION**2)
 
 
 def test_straight_passages_keep_the_footprint():

@@ -2,9 +2,9 @@
 Path tracer with footprints (`glints_path`)
 ===========================================
 
-A path tracer that hands the camera's ray differentials to the material of the first vertex, so that glint BSDFs (and
-any other that filters textures) see the pixel's footprint there. Mitsuba's own `path` drops them. Otherwise it renders
-what `path` renders: on scenes without glints both converge to the same image.
+A path tracer that carries the pixel's footprint along its paths, so that glint BSDFs (and any other that filters
+textures) see at every vertex what part of their surface one sample stands for. Mitsuba's own `path` drops ray
+differentials. Otherwise it renders what `path` renders: on scenes without glints both converge to the same image.
 
 | Parameter       | Type            | Meaning                                                                           |
 |-----------------|-----------------|-----------------------------------------------------------------------------------|
@@ -21,14 +21,53 @@ what `path` renders: on scenes without glints both converge to the same image.
 |                 |                 | A number: that many pixels, whatever the number of samples. 0 switches filtering  |
 |                 |                 | off.                                                                              |
 |                 |                 | (Default: `sample`)                                                               |
+| `indirect_      | float           | Footprint behind the first bounce (Section 5.3 of Deng et al. 2022). The number   |
+| footprint`      |                 | scales the spread of rough bounces; mirrors and glass pass the footprint on in any|
+|                 |                 | case. 0: deeper vertices have none, glint BSDFs use the texel under the point.    |
+|                 |                 | (Default: 1)                                                                      |
+| `environment_   | boolean         | Light of the environment that glint BSDFs reflect is prefiltered (Section 5.4):   |
+| prefilter`      |                 | their NDF is averaged over the extent of a piece of the environment, instead of   |
+|                 |                 | being sampled. Far less noise, some bias. (Default: false)                        |
+| `environment_   | integer         | Number of those pieces, spherical Gaussians, at most 1024. More: less bias, more  |
+| lobes`          |                 | noise. (Default: 32)                                                              |
+| `environment_   | float           | A piece extends to where its Gaussian has so many times its peak, in (0, 1).      |
+| epsilon`        |                 | (Default: 0.3)                                                                    |
+
+The footprint behind a bounce
+-----------------------------
+
+- Ray differentials (Igehy 1999) pass mirrors and refractions, with the shape's own curvature; behind a plane mirror the
+  footprint is that of the mirrored camera.
+- A rough bounce (glossy, diffuse, glints) spreads the footprint by the square of solid angle that one sample stands for,
+  1 / pdf of the drawn direction, a side of at most 45 degrees; with `footprint` = `sample` divided by the number of samples
+  per pixel, with a number of pixels times the square of that number. The spread is independent of the pixel's own
+  extent: the two add as variances, and glints see one parallelogram with the sum. (See path_footprint.h.)
+- With `sample` the image still converges to the unfiltered one. With `pixel` it is smoother: what a lobe reflects is seen
+  through a single direction, and over all of the surface that the lobe meets, taken as flat.
+- Large footprints cost time: with `glints_ibm` little, with `glints_yan16` and `glints_direct` in proportion to the texels.
+
+Environment prefiltering
+------------------------
+
+- The environment (any kind: `envmap`, `constant`, `sunsky`) becomes a mixture of spherical Gaussians, fitted when the first
+  sample of a scene is taken; the log says how long that took, and how much light the mixture has in other places than the
+  map. Each direction's light is divided among the Gaussians, so energy is kept, in all colours. If the
+  environment is changed afterwards, make a new integrator.
+- At a glint BSDF one Gaussian is drawn, by its energy times a cheap NDF, and a direction from it for shadows and Fresnel
+  term. The NDF is averaged over the rectangle of half vectors that the Gaussian's extent covers. Directions that the BSDF
+  draws count nothing when they meet the environment: there is no multiple importance sampling between the two ways.
+  Other emitters, other materials and the visible background are as without prefiltering.
+- It needs range queries of the NDF: `glints_direct` and `glints_unfiltered` have them, alone or in `twosided`. Other glint
+  BSDFs are rendered unprefiltered, and a warning names them once.
+- Use it where glints reflect windows, softboxes and skies that are small against the whole of their lobe. It blurs the shapes of
+  lights in nearly smooth metal: unsuitable where NDFs are narrower than the lights' pieces.
 
 Guidance
 --------
 
 - `pixel` is right for convergence plots over the number of samples: with `sample` each point of the plot is another
   estimator.
-- Deeper vertices have no footprint: glint BSDFs use the texel under the point there, without warning. Straight
-  passages through `mask` or `null` materials do not count as vertices.
+- Straight passages through `mask` or `null` materials do not count as vertices.
 - The scale is taken from the sampler's sample count. If `samples_per_pass` (deprecated in Mitsuba) is set on this
   integrator it is accounted for; on an integrator that wraps this one (`aov`, `moment`) it is not.
 - No participating media. Differentials exist for sensors that provide them, such as `perspective`.
@@ -47,11 +86,15 @@ Python:
 */
 #include "abi.h"
 
+#include "environment_light.h"
 #include "footprint_scope.h"
+#include "path_footprint.h"
 #include "registry.h"
 
+#include <atomic>
 #include <cmath>
 #include <cstdlib>
+#include <memory>
 #include <mitsuba/core/ray.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/emitter.h>
@@ -60,6 +103,7 @@ Python:
 #include <mitsuba/render/sampler.h>
 #include <mitsuba/render/scene.h>
 #include <mitsuba/render/shape.h>
+#include <mutex>
 
 namespace glints_mitsuba {
 
@@ -82,6 +126,9 @@ public:
 
     /// Factor on differentials that Mitsuba has shrunk for `samples` samples per pixel.
     float scale(uint32_t samples) const { return m_per_sample ? 1.f : m_pixels * std::sqrt((float) samples); }
+
+    /// The share of a pixel's side that a sample stands for.
+    float width(uint32_t samples) const { return m_per_sample ? 1.f / std::sqrt((float) samples) : m_pixels; }
 
     std::string to_string() const { return m_per_sample ? "sample" : tfm::format("%s pixels", m_pixels); }
 
@@ -109,8 +156,24 @@ class GlintsPath final : public MonteCarloIntegrator<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(MonteCarloIntegrator, m_max_depth, m_rr_depth, m_hide_emitters, m_samples_per_pass)
     MI_IMPORT_TYPES(Scene, Sampler, Medium, EmitterPtr, BSDFPtr)
+    using Environment = EnvironmentLight<Float, Spectrum>;
+    using Prefiltered = PrefilteredBSDF<Float, Spectrum>;
 
-    explicit GlintsPath(const Properties &props) : Base(props), m_footprint(props) {}
+    explicit GlintsPath(const Properties &props)
+        : Base(props), m_footprint(props), m_indirect(props.get<float>("indirect_footprint", 1.f)),
+          m_prefilter(props.get<bool>("environment_prefilter", false)),
+          m_lobes(unsigned_parameter(props, "environment_lobes", 32)),
+          m_epsilon(props.get<float>("environment_epsilon", .3f)) {
+        auto check = [&](bool right, const char *name, const char *domain) {
+            if (!right)
+                Throw("%s: parameter \"%s\" is %s; it must be %s.", props.plugin_name(), name, props.as_string(name),
+                      domain);
+        };
+        check(std::isfinite(m_indirect) && m_indirect >= 0.f, "indirect_footprint",
+              "a factor that is finite and not negative, 0 to switch deeper footprints off");
+        check(m_lobes >= 1 && m_lobes <= 1024, "environment_lobes", "a number of spherical Gaussians in [1, 1024]");
+        check(m_epsilon > 0.f && m_epsilon < 1.f, "environment_epsilon", "in (0, 1)");
+    }
 
     std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler, const RayDifferential3f &camera_ray,
                                      const Medium *, Float *, Mask active) const override {
@@ -124,8 +187,11 @@ public:
     }
 
     std::string to_string() const override {
-        return tfm::format("GlintsPath[\n  max_depth = %i,\n  rr_depth = %i,\n  footprint = %s\n]", (int) m_max_depth,
-                           (int) m_rr_depth, m_footprint.to_string());
+        return tfm::format("GlintsPath[\n  max_depth = %i,\n  rr_depth = %i,\n  footprint = %s,\n"
+                           "  indirect_footprint = %s,\n  environment_prefilter = %s,\n  environment_lobes = %i,\n"
+                           "  environment_epsilon = %s\n]",
+                           (int) m_max_depth, (int) m_rr_depth, m_footprint.to_string(), m_indirect, m_prefilter,
+                           m_lobes, m_epsilon);
     }
 
     MI_DECLARE_CLASS(GlintsPath)
@@ -135,7 +201,9 @@ private:
     struct Walk {
         Walk(const GlintsPath &integrator, const Scene *scene, Sampler *sampler, const RayDifferential3f &camera_ray)
             : integrator(integrator), scene(scene), sampler(sampler), ray(camera_ray),
-              visible(!integrator.m_hide_emitters && scene->environment() != nullptr) {
+              visible(!integrator.m_hide_emitters && scene->environment() != nullptr),
+              environment(integrator.environment(scene)),
+              footprint(integrator.m_indirect * integrator.m_footprint.width(integrator.samples_per_pixel(sampler))) {
             float scale = integrator.m_footprint.scale(integrator.samples_per_pixel(sampler));
             ray.scale_differential(scale);
             ray.has_differentials = ray.has_differentials && scale > 0.f;
@@ -150,23 +218,58 @@ private:
 
             // A camera without differentials is worth a warning of the BSDF; a deeper vertex or footprint=0 is not.
             NoFootprintScope scope(!(at_camera_vertex && integrator.m_footprint.scale(1) > 0.f));
+            footprint.meet(si, ray);
             BSDFPtr bsdf = si.bsdf(ray);
-            if (has_flag(bsdf->flags(), BSDFFlags::Smooth))
+            const Prefiltered *prefiltered = prefiltered_side(si, bsdf);
+            if (prefiltered)
+                reflect_environment(si, *prefiltered);
+            environment_is_gathered = prefiltered != nullptr;
+            if (has_flag(bsdf->flags(), BSDFFlags::Smooth) && !(prefiltered && scene->emitters().size() == 1))
                 connect_to_emitter(si, bsdf);
             return scatter(si, bsdf) && survive_roulette();
         }
 
         SurfaceInteraction3f intersect() const {
             if (depth > 0 || !integrator.m_hide_emitters)
-                return scene->ray_intersect(ray, +RayFlags::All, /* coherent = */ depth == 0);
+                return scene->ray_intersect(ray, integrator.ray_flags(), /* coherent = */ depth == 0);
             auto behind_emitters = integrator.skip_area_emitters(scene, ray, /* coherent = */ true);
-            return behind_emitters.compute_surface_interaction(ray, +RayFlags::All);
+            return behind_emitters.compute_surface_interaction(ray, integrator.ray_flags());
+        }
+
+        /// The BSDF that gathers the environment's light by itself, seen from this side; null: light is gathered by
+        /// emitter sampling and by the walk.
+        const Prefiltered *prefiltered_side(const SurfaceInteraction3f &si, BSDFPtr bsdf) const {
+            if (!environment)
+                return nullptr;
+            auto sides = environment->sides(bsdf);
+            return Frame3f::cos_theta(si.wi) < 0.f ? sides.back : sides.front;
+        }
+
+        /// Light of one of the environment's lobes, averaged over its extent by the BSDF.
+        void reflect_environment(const SurfaceInteraction3f &si, const Prefiltered &bsdf) {
+            Float u1 = sampler->next_1d();
+            Point2f u2 = sampler->next_2d();
+            // As `twosided` does it: from behind, z points the other way.
+            Float side = dr::sign(Frame3f::cos_theta(si.wi));
+            SurfaceInteraction3f seen = si;
+            seen.wi.z() *= side;
+            auto drawn = bsdf.sample_environment(seen, side * si.sh_frame.n, *environment->mixture(), u1, u2);
+            if (!drawn.valid || dr::all(unpolarized_spectrum(drawn.weight) == 0.f))
+                return;
+            Vector3f wo = drawn.wo;
+            wo.z() *= side;
+            if (scene->ray_test(si.spawn_ray(si.to_world(wo))))
+                return;
+            radiance += throughput * si.to_world_mueller(drawn.weight, -wo, si.wi) *
+                        environment->energy(drawn.lobe, si.wavelengths);
         }
 
         /// Emission that the walk itself has found, weighted against what `connect_to_emitter` would have found.
         void gather_emission(const SurfaceInteraction3f &si) {
             EmitterPtr emitter = si.emitter(scene);
             if (!emitter || (depth == 0 && integrator.m_hide_emitters))
+                return;
+            if (environment_is_gathered && emitter == scene->environment())
                 return;
             Float weight = 1.f;
             if (!previous_was_delta) {
@@ -180,6 +283,8 @@ private:
         void connect_to_emitter(const SurfaceInteraction3f &si, BSDFPtr bsdf) {
             auto [ds, emitted] = scene->sample_emitter_direction(si, sampler->next_2d(), /* test_visibility = */ true);
             if (ds.pdf == 0.f || dr::all(unpolarized_spectrum(emitted) == 0.f))
+                return;
+            if (environment_is_gathered && ds.emitter == scene->environment())
                 return;
             Vector3f wo = si.to_local(ds.d);
             auto [reflected, pdf] = bsdf->eval_pdf(BSDFContext(), si, wo);
@@ -197,7 +302,7 @@ private:
 
             bool passes_straight = has_flag(bs.sampled_type, BSDFFlags::Null);
             visible |= !passes_straight;
-            continue_along(si.spawn_ray(si.to_world(bs.wo)), passes_straight);
+            continue_along(si, bs, passes_straight);
 
             previous = si;
             previous_pdf = bs.pdf;
@@ -206,9 +311,12 @@ private:
             return dr::any(unpolarized_spectrum(throughput) != 0.f);
         }
 
-        /// The offset rays of the differentials are still right behind a straight passage, and nowhere else.
-        void continue_along(const Ray3f &next, bool straight) {
+        /// A straight passage leaves everything about the ray's bundle as it was.
+        void continue_along(const SurfaceInteraction3f &si, const BSDFSample3f &bs, bool straight) {
             at_camera_vertex &= straight;
+            Ray3f next = si.spawn_ray(si.to_world(bs.wo));
+            if (!straight && integrator.m_indirect > 0.f)
+                footprint.bounce(si, ray, bs, next);
             RayDifferential3f offsets = ray;
             ray = RayDifferential3f(next);
             if (straight && offsets.has_differentials) {
@@ -239,6 +347,10 @@ private:
         bool visible; ///< for the alpha channel
         bool at_camera_vertex = true;
 
+        const Environment *environment;       ///< null: nothing is prefiltered
+        bool environment_is_gathered = false; ///< at the last vertex, by its prefiltered BSDF
+        PathFootprint<Float, Spectrum> footprint;
+
         Interaction3f previous = dr::zeros<Interaction3f>();
         Float previous_pdf = 1.f;
         bool previous_was_delta = true; ///< the camera: nothing else can find what its rays hit
@@ -254,7 +366,36 @@ private:
         return std::min(sampler->sample_count(), m_samples_per_pass);
     }
 
+    /// With the derivatives of normals, which carry footprints over curved mirrors.
+    uint32_t ray_flags() const { return +RayFlags::All | (m_indirect > 0.f ? +RayFlags::dNSdUV : 0u); }
+
+    /// The scene's environment as this integrator prefilters it, fitted when it is first asked for; null: not at all.
+    const Environment *environment(const Scene *scene) const {
+        if (!m_prefilter || !scene->environment())
+            return nullptr;
+        const Environment *known = m_environment.load(std::memory_order_acquire);
+        if (!known || known->emitter() != scene->environment()) {
+            std::lock_guard<std::mutex> guard(m_mutex);
+            auto fits = [&](const auto &e) { return e->emitter() == scene->environment(); };
+            auto found = std::find_if(m_environments.begin(), m_environments.end(), fits);
+            if (found == m_environments.end())
+                found = m_environments.insert(found,
+                                              std::make_unique<Environment>("glints_path", scene, m_lobes, m_epsilon));
+            known = found->get();
+            m_environment.store(known, std::memory_order_release);
+        }
+        return known->mixture() ? known : nullptr;
+    }
+
     FootprintRule m_footprint;
+    float m_indirect;
+    bool m_prefilter;
+    uint32_t m_lobes;
+    float m_epsilon;
+
+    mutable std::mutex m_mutex;
+    mutable std::vector<std::unique_ptr<Environment>> m_environments; ///< of all scenes seen, kept for other threads
+    mutable std::atomic<const Environment *> m_environment{nullptr};
 };
 
 template <typename Float, typename Spectrum>

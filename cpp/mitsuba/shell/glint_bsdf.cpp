@@ -5,6 +5,7 @@
 #include "glint_bsdf.h"
 #include "input_warnings.h"
 #include "parameters.h"
+#include "prefiltered_bsdf.h"
 #include "reflectance.h"
 #include "registry.h"
 #include "uv_footprint.h"
@@ -63,7 +64,7 @@ glints::Vec3 vec3(const Vector<float, 3> &v) { return {v.x(), v.y(), v.z()}; }
  * of a footprint have different planes of incidence, and their mixture is approximated as unpolarised.
  */
 template <typename Float, typename Spectrum>
-class GlintBSDF final : public BSDF<Float, Spectrum> {
+class GlintBSDF final : public BSDF<Float, Spectrum>, public PrefilteredBSDF<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(BSDF, m_flags, m_components)
     MI_IMPORT_TYPES(Texture)
@@ -110,6 +111,21 @@ public:
             return {0.f, 0.f};
         glints::Evaluation e = m_brdf.evaluate(footprint(si), vec3(si.wi), vec3(wo));
         return {coloured(si, wo, e.value), e.pdf};
+    }
+
+    bool prefilters() const override { return m_brdf.prefilters(); }
+
+    typename PrefilteredBSDF<Float, Spectrum>::Draw sample_environment(const SurfaceInteraction3f &si,
+                                                                       const Vector3f &z,
+                                                                       const glints::Environment &environment,
+                                                                       Float u1, const Point2f &u2) const override {
+        glints::LobeSample s =
+            m_brdf.sample_environment(footprint(si), vec3(si.wi), vec3(si.sh_frame.s), vec3(si.sh_frame.t), vec3(z),
+                                      environment, u1, u2.x(), u2.y());
+        if (!s.valid)
+            return {};
+        Vector3f wo(s.wo.x, s.wo.y, s.wo.z);
+        return {s.lobe, wo, coloured(si, wo, s.value / s.probability), true};
     }
 
     void traverse(TraversalCallback *callback) override { m_reflectance.traverse(callback); }
