@@ -24,7 +24,18 @@ SCENES_DIR = Path(__file__).resolve().parent
 if str(SCENES_DIR) not in sys.path:
     sys.path.insert(0, str(SCENES_DIR))
 
-from scene_assets import car_wheel, environment, kettle, maps, mesh, shoe, wing_mirror
+from scene_assets import (
+    bent_quad,
+    car_bonnet,
+    car_wheel,
+    environment,
+    kettle,
+    kettle_mirror,
+    maps,
+    mesh,
+    shoe,
+    wing_mirror,
+)
 
 DEFAULT_CACHE = SCENES_DIR.parent / ".cache" / "scenes"
 MAPS = tuple(maps.RECIPES)
@@ -104,6 +115,9 @@ def groups(map_resolution: int | None = None) -> list[Group]:
         _mesh_group("shoe", shoe, shoe.PARTS),
         _mesh_group("car_wheel", car_wheel, car_wheel.PARTS),
         _mesh_group("wing_mirror", wing_mirror, wing_mirror.PARTS),
+        _mesh_group("car_bonnet", car_bonnet, car_bonnet.PARTS),
+        _mesh_group("kettle_mirror", kettle_mirror, kettle_mirror.PARTS),
+        _mesh_group("bent_quad", bent_quad, bent_quad.PARTS),
     ]
 
 

@@ -36,8 +36,8 @@ def test_the_scenes_of_the_project_have_slots():
     names = ("isotropic", "brushed", "flakes", "scratches")
     here = {"assets": folder, "maps": {name: folder / f"{name[0]}.exr" for name in names}}
     found = {scene.name: scene for scene in scenes.find_scenes(folder, ["all"], lambda: here)}
-    assert list(found) == ["shoes", "kettle", "car_wheel", "wing_mirror"]
-    assert [scene.normal_map.name for scene in found.values()] == ["i.exr", "b.exr", "s.exr", "f.exr"]
+    assert list(found) == ["shoes", "kettle", "bent_quad", "car_bonnet", "car_wheel", "kettle_mirror", "wing_mirror"]
+    assert [scene.normal_map.name for scene in found.values()] == [f"{name}.exr" for name in "ibifsbf"]
     assert all(scene.crops and scene.alpha > 0 for scene in found.values())
 
 

@@ -10,7 +10,7 @@ from glints_harness.cli import ROOT, scene_assets
 from glints_harness.methods import METHODS, choose
 from glints_harness.report import text
 from mini import no_assets
-from scene_assets import car_wheel, kettle, maps, shoe, wing_mirror
+from scene_assets import bent_quad, car_bonnet, car_wheel, kettle, maps, shoe, wing_mirror
 from scipy import stats
 
 FOLDER = ROOT / "mitsuba_scenes"
@@ -20,7 +20,12 @@ GLINTING_MESHES = {
     "kettle": (kettle, "kettle_metal"),
     "wing_mirror": (wing_mirror, "wing_mirror_paint"),
     "car_wheel": (car_wheel, "car_wheel_metal"),
+    "car_bonnet": (car_bonnet, "car_bonnet_paint"),
+    "bent_quad": (bent_quad, "bent_quad_metal"),
 }
+
+IN_THE_MIRROR = {"kettle_mirror": "crop1"}
+"""Crops that show the glinting part in a mirror, which has this name in the scene."""
 
 
 @pytest.fixture(scope="module")
@@ -138,34 +143,78 @@ def test_scenes_load_and_their_crops_lie_on_the_glinting_part(name, project_scen
     scene = project_scenes[name]
     render.prepare_thread()
     loaded = render.LoadedScene(scene.text(METHODS["roughconductor"], 1))
-    identity = scene.first_slot().element.get("id")
     views = scene.views(scenes.FULL_SIZE, 64)
     for view in (views["crop1"], views["crop2"]):
+        mirrored = IN_THE_MIRROR.get(name) == view.name
+        identity = "mirror" if mirrored else scene.first_slot().element.get("id")
         assert len(loaded.glinting_pixels(identity, view, 16)) > 0.75 * 16**2, view
-    image = loaded.render(views["frame"], render.Lighting(), 16, 1).image
+    image = loaded.render(views["frame"], render.Lighting(max_depth=max(2, scene.max_depth)), 16, 1).image
     assert np.isfinite(image).all()
     assert 0.03 < image.mean() < 1.0
     assert (image.max(axis=-1) > 1).mean() < 0.1
 
 
-@pytest.mark.parametrize("name, window", [("wing_mirror", (425, 300, 40, 40)), ("car_wheel", (396, 332, 24, 24))])
-def test_the_map_makes_the_new_scenes_glint(name, window, project_scenes):
+@pytest.mark.parametrize(
+    "name, window, spp",
+    [
+        ("wing_mirror", (425, 300, 40, 40), 64),
+        ("car_wheel", (396, 332, 24, 24), 64),
+        ("bent_quad", (280, 280, 32, 32), 64),
+        ("kettle_mirror", (420, 340, 24, 40), 256),
+    ],
+)
+def test_the_map_makes_the_new_scenes_glint(name, window, spp, project_scenes):
     """Neighbouring pixels differ, and by the same in another rendering; without the map, hardly.
 
-    The windows show nothing but metal. Highlights are compressed, so that one bright glint does not decide.
+    The windows show nothing but metal, that of `kettle_mirror` in the mirror. Highlights are compressed, so that one bright glint does not decide.
     """
     scene = project_scenes[name]
     view = scenes.View("window", scenes.FULL_SIZE, scenes.FULL_SIZE, window)
 
     def structure(method):
         loaded = render.LoadedScene(scene.text(METHODS[method], 1))
-        lighting = render.Lighting(footprint="pixel")
-        means = (loaded.render(view, lighting, 64, seed).image.mean(axis=-1) for seed in (1, 2))
+        lighting = render.Lighting(max_depth=max(2, scene.max_depth), footprint="pixel")
+        means = (loaded.render(view, lighting, spp, seed).image.mean(axis=-1) for seed in (1, 2))
         first, second = (np.diff(mean / (0.3 + mean), axis=1) for mean in means)
         return np.mean(first * second)
 
     render.prepare_thread()
     assert structure("glints_ibm") > 10 * abs(structure("roughconductor"))
+
+
+def test_pixels_of_the_bonnet_cover_about_a_tile_or_many(project_scenes):
+    """About 1000 tiles across the picture, so most pixels see a whole map (2022 paper, Section 6.2), and some far more."""
+    scene = project_scenes["car_bonnet"]
+    render.prepare_thread()
+    loaded = render.LoadedScene(scene.text(METHODS["roughconductor"], 1))
+    view = scene.views(scenes.FULL_SIZE, scenes.FULL_SIZE)["frame"]
+    tiles = loaded.glinting_pixels("glints", view, 64)
+    assert len(tiles) > 0.7 * 64**2
+    assert 800 < scenes.FULL_SIZE * np.median(tiles) < 1400
+    assert np.percentile(tiles, 1) > 0.5 and np.percentile(tiles, 99) > 2
+    finer = render.LoadedScene(scene.text(METHODS["roughconductor"], 8)).glinting_pixels("glints", view, 8)
+    assert np.allclose(finer, loaded.glinting_pixels("glints", view, 8)), "the tiling is the map's, not the mesh's"
+
+
+def test_paths_are_as_long_as_a_scene_asks_for():
+    chosen = settings(all_scenes())
+    depths = {(run.scene, run.view.name): run.lighting.max_depth for run in plan.RunPlan(chosen).runs}
+    assert (depths["kettle", "crop1"], depths["kettle", "frame"]) == (2, 3)
+    assert (
+        depths["kettle_mirror", "crop1"] == depths["kettle_mirror", "frame"] == LISTING["kettle_mirror"]["max_depth"]
+    )
+    for key, _ in plan.references(chosen):
+        lighting = chosen.lighting_of(chosen.scene(key.scene), key.view)
+        assert lighting.max_depth == depths[key.scene, key.view.name]
+
+
+def test_a_wrong_depth_is_refused(mini_folder, tmp_path):
+    for file in ("mini.xml", "maps/flakes.exr"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_bytes((mini_folder / file).read_bytes())
+    (tmp_path / "scenes.json").write_text(json.dumps({"mini": {"max_depth": "4"}}), encoding="utf-8")
+    with pytest.raises(ValueError, match="scenes.json: mini: max_depth is '4'; it has to be a number"):
+        scenes.find_scenes(tmp_path, ["mini"], no_assets)
 
 
 # ---- reduced plans ---------------------------------------------------------------------------------------------------

@@ -155,7 +155,7 @@ class Comparison:
         settings, groups = self.settings, {}
         for key, share in references(settings):
             kept = self.recover(self.store.find, self.describe_reference(key)) or Reference.empty(key.view)
-            lighting, seconds = settings.lighting_of(key.view), settings.reference_seconds * share
+            lighting, seconds = self.reference_lighting(key), settings.reference_seconds * share
             wanted = Wanted(key, lighting, kept, seconds, settings.reference_spp)
             self.references[key] = kept
             if not wanted.complete:
@@ -167,10 +167,14 @@ class Comparison:
         text, _ = self.texts.of(self.settings.scene(scene), SURFACES[surface], tiling)
         return ReferenceJob(f"{scene} x{tiling:g}: reference ({surface})", text, tuple(wanted))
 
+    def reference_lighting(self, key):
+        """The integrator of a reference: that of the runs that are held against it."""
+        return self.settings.lighting_of(self.settings.scene(key.scene), key.view)
+
     def describe_reference(self, key: ReferenceKey):
         """What the store knows a reference by."""
         _, digest = self.texts.of(self.settings.scene(key.scene), SURFACES[key.surface], key.tiling)
-        return self.store.describe(key, self.settings.lighting_of(key.view), digest)
+        return self.store.describe(key, self.reference_lighting(key), digest)
 
     # ---- runs --------------------------------------------------------------------------------------------------------
 

@@ -91,9 +91,9 @@ class Settings:
         """(scene, tiling) of everything that is compared."""
         return [(scene, tiling) for scene in self.scenes for tiling in self.of(scene).tilings]
 
-    def lighting_of(self, view, rule="none"):
-        """The integrator of a view, with a footprint rule."""
-        depth = self.frame_depth if is_frame(view) else self.lighting.max_depth
+    def lighting_of(self, scene, view, rule="none"):
+        """The integrator of a view of a scene, with a footprint rule."""
+        depth = max(scene.max_depth, self.frame_depth if is_frame(view) else self.lighting.max_depth)
         return replace(self.lighting, max_depth=depth, footprint=rule)
 
     def rules(self, method):
@@ -197,7 +197,9 @@ class RunPlan:
         rules = settings.rules(method)
 
         def run(view, rule, spp, seed, **more):
-            return Run(scene.name, tiling, method.name, view, settings.lighting_of(view, rule), spp, seed, **more)
+            return Run(
+                scene.name, tiling, method.name, view, settings.lighting_of(scene, view, rule), spp, seed, **more
+            )
 
         def crop_runs(spp=None, **more):
             return [run(crop, rule, spp, seed, **more) for rule in rules for crop in crops for seed in self.seeds()]
@@ -222,7 +224,7 @@ class RunPlan:
         """The first crop at one sample count."""
         crop = self.settings.first_crop(scene)
         return [
-            Run(scene.name, tiling, method.name, crop, self.settings.lighting_of(crop, rule), SWEEP_SPP, seed)
+            Run(scene.name, tiling, method.name, crop, self.settings.lighting_of(scene, crop, rule), SWEEP_SPP, seed)
             for rule in self.settings.rules(method)
             for seed in self.seeds()
         ]
@@ -236,7 +238,7 @@ class RunPlan:
                 tiling,
                 method.name,
                 view,
-                settings.lighting_of(view, rule),
+                settings.lighting_of(scene, view, rule),
                 SEQUENCE_SPP,
                 FIRST_SEED + view.frame,
             )

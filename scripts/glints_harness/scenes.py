@@ -104,6 +104,9 @@ class Scene:
     """(x, y, width, height) in pixels of a frame of `FULL_SIZE` pixels."""
     reduced: Reduced | None = None
     """None: everything is compared."""
+    max_depth: int = 0
+    """Paths are at least as long as this many segments wherever the scene is rendered: entry `max_depth` of
+    `scenes.json`, for a scene that is there to show light that comes round a corner. 0: as long as anywhere."""
 
     @property
     def base_tiles(self):
@@ -242,7 +245,7 @@ def open_scene(path, folder, assets):
     values = {item.get("name"): item.get("value") for item in xml.parse(path).getroot().findall("default")}
     if "assets" in values:
         values["assets"] = str(assets()["assets"])
-    scene = Scene(path.stem, path, values, find_crops(path.stem, folder))
+    scene = Scene(path.stem, path, values, find_crops(path.stem, folder), max_depth=find_depth(path.stem, folder))
     if not (path.parent / scene.normal_map).is_file():
         if "normalmap" not in values:
             raise ValueError(f"{path}: the normal map {scene.normal_map} does not exist")
@@ -269,6 +272,16 @@ def find_crops(name, folder):
     if "crops" in entry:
         return tuple((*crop, *CROP_SIZE)[:4] for crop in entry["crops"])
     return PAPER_CROPS.get(name, CENTRAL_CROPS)
+
+
+def find_depth(name, folder):
+    """Least length of the longest paths from the folder's `scenes.json`; 0 if it has none."""
+    depth = listed(name, folder).get("max_depth", 0)
+    if type(depth) is not int or depth < 0:
+        raise ValueError(
+            f"{Path(folder) / 'scenes.json'}: {name}: max_depth is {depth!r}; it has to be a number, 1 or more"
+        )
+    return depth
 
 
 def reduce(scene, folder):
