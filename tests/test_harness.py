@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 import support
 import test_report
-from glints_harness import bench, cli, compare, executors, files, images, maps, metrics, plan, render, scenes
+from glints_harness import bench, cli, compare, executors, files, images, maps, metrics, plan, ranks, render, scenes
+from glints_harness.cli import ROOT, scene_assets
+from glints_harness.images import read_exr
 from glints_harness.methods import GLINTS, METHODS, check_plugins, choose
 from glints_harness.progress import Silent
 from glints_harness.report import text
@@ -174,12 +176,16 @@ def comparison(mini_folder, tmp_path_factory):
     return out, cache, json.loads((out / "results.json").read_text(encoding="utf-8"))
 
 
+PRECOMPUTED = [name for name, method in METHODS.items() if method.if_kept]
+"""Methods that are compared where their precomputation is kept, unless they are named: not in this scene."""
+
+
 def curves():
-    """Every method with its footprint rules, but for those that are rendered at few points."""
+    """Every method with its footprint rules, but for those that are rendered at few points or that are precomputed."""
     return [
         (name, rule)
         for name, method in METHODS.items()
-        if not method.sparse
+        if not method.sparse and name not in PRECOMPUTED
         for rule in (("sample", "pixel") if name == "glints_ibm" else ("sample",) if method.filters else ("none",))
     ]
 
@@ -206,6 +212,7 @@ def test_results_list_every_run(comparison):
     assert sweep == {(*curve, tiling) for curve in curves() for tiling in (2, 4)}
     unmeasured = {item["method"] for item in results["sweep"] if not item["errors"]}
     assert unmeasured == {name for name, method in METHODS.items() if method.surface != "texels"}
+    assert results["unprepared"] == {"mini": PRECOMPUTED} and results["prefiltering"] == []
     table_4 = {(item["scene"], item["method"]) for item in results["table_4"]}
     assert table_4 == {("mini", "glints_ibm"), ("mini", "glints_ibm_paper")}
     for record in records:
@@ -261,6 +268,7 @@ def test_methods_of_one_model_have_the_mean_of_the_reference(comparison):
     truth = np.load(path)["mean"].mean()
     frames = [record for record in results["records"] if record["view"] == "frame"]
     means = {record["method"]: images.read_exr(out / record["image"]).mean() / truth for record in frames}
+    assert not set(PRECOMPUTED) & set(means)
     alike = [name for name in means if METHODS[name].model == GLINTS and METHODS[name].surface == "texels"]
     # 4 samples in each of 1024 pixels give about 2 %. Flakes seven times as rough are another surface.
     assert all(abs(means[name] - 1) < 0.08 for name in alike), means
@@ -288,6 +296,25 @@ def test_the_report_of_a_comparison_opens_without_complaint(comparison):
     first = next(item for item in results["summaries"] if (item["view"], item["spp"]) == ("crop1", 1))
     mean = images.read_exr(out / "runs" / "mini-x2" / "crop1" / "reference-texels.exr").mean()
     assert shown[0] == text.percent(first["errors"]["mean_error"]["total"]["value"] / mean)
+
+
+def test_a_precomputed_method_is_compared_once_it_has_been_named(mini_folder, tmp_path):
+    """By default it waits for its precomputation, and says so; named, it makes it; from then on it takes part."""
+    few = ("--tiling", "2", "--spp", "1", "--seeds", "2", "--reference-spp", "20", "--sweep", "none", "--frames", "0")
+    everything = ("--no-report", *few)
+    before = run_compare(mini_folder, tmp_path / "before", tmp_path, *everything)
+    assert before.returncode == 0, before.stderr
+    said = " ".join(before.stdout.split())
+    assert f"Left out of mini: {', '.join(PRECOMPUTED)}, not precomputed yet" in said
+    assert "./scripts/compare --scene mini --methods glints_tensor" in said
+    methods = lambda out: {record["method"] for record in json.loads((out / "results.json").read_text())["records"]}
+    assert not methods(tmp_path / "before") & set(PRECOMPUTED)
+    named = run_compare(mini_folder, tmp_path / "named", tmp_path, *everything, "--methods", "glints_tensor")
+    assert named.returncode == 0, named.stderr
+    assert methods(tmp_path / "named") == {"glints_tensor"}
+    after = run_compare(mini_folder, tmp_path / "after", tmp_path, *everything)
+    assert after.returncode == 0 and "not precomputed" not in after.stdout, after.stdout
+    assert methods(tmp_path / "after") == set(METHODS)
 
 
 def test_a_second_comparison_reuses_what_is_kept(comparison, mini_folder, tmp_path):
@@ -375,6 +402,51 @@ def test_slow_points_are_left_out_and_said_so(mini, tmp_path):
     assert "mini x1: roughconductor" in said
 
 
+# ---- precomputed methods and prefiltered light -----------------------------------------------------------------------
+
+
+def tensor(mini_folder, **changed):
+    return replace(METHODS["glints_tensor"], store=mini_folder / "store", **changed)
+
+
+def test_a_precomputation_is_found_by_what_decides_it(mini, tmp_path):
+    method, slot = tensor(tmp_path), mini.first_slot()
+    folder = method.precomputation(slot)
+    element = method.element(slot)
+    assert element.find("string[@name='cache']").get("value") == str(folder)
+    assert not method.is_kept(slot)
+    folder.mkdir(parents=True)
+    (folder / ".unfinished-tensor.glints").touch()
+    assert not method.is_kept(slot)
+    (folder / "tensor.glints").touch()
+    assert method.is_kept(slot)
+    assert tensor(tmp_path, environment_prefilter=True).is_kept(slot)
+    assert not tensor(tmp_path, parameters={"rank": 32}).is_kept(slot)
+    slot.conductor.find("float[@name='alpha']").set("value", "0.2")
+    assert not method.is_kept(slot)
+
+
+def test_where_a_precomputation_lies_does_not_decide_a_scene(mini, tmp_path):
+    texts = [mini.text(tensor(tmp_path / name), 1) for name in "ab"]
+    assert texts[0] != texts[1]
+    assert scenes.scene_digest(texts[0]) == scenes.scene_digest(texts[1])
+    assert scenes.scene_digest(texts[0]) != scenes.scene_digest(mini.text(tensor(tmp_path, parameters={"rank": 3}), 1))
+
+
+def test_prefiltered_light_is_the_path_tracers(mini_folder, tmp_path):
+    options = cli.parser().parse_args(["--scene-dir", str(mini_folder), "--cache", str(tmp_path)])
+    names = [method.name for method in cli.chosen_methods(options)]
+    assert names == list(METHODS)
+    options.integrator = "direct"
+    assert "glints_tensor_prefiltered" not in [method.name for method in cli.chosen_methods(options)]
+    options.methods = "glints_tensor_prefiltered"
+    with pytest.raises(ValueError, match="glints_tensor_prefiltered needs the integrator glints_path"):
+        cli.chosen_methods(options)
+    options.integrator = "glints_path"
+    (method,) = cli.chosen_methods(options)
+    assert method.store == tmp_path / "precomputed" and not method.if_kept
+
+
 # ---- benchmarks ------------------------------------------------------------------------------------------------------
 
 
@@ -411,3 +483,35 @@ def test_the_rust_benchmark_counts_memory_and_measures_both_structures(mini_fold
     (worst,) = (r for r in records if r["name"] == "ibm/eval/worst")
     evals = [r["value"] for r in records if r["name"] == "ibm/eval"]
     assert worst["value"] == max(evals) and worst["params"]["alpha"] == 0.05
+
+
+def test_images_of_a_precomputation_are_counted_by_level():
+    assert ranks.image_count(512**2, 1) == 16**2
+    assert ranks.image_count(512**2, 5) == 16**2 + 8**2 + 4**2 + 2**2 + 1
+    assert ranks.image_count(100**2, 2) == 4**2 + 2**2
+
+
+@pytest.mark.skipif(shutil.which("cargo") is None, reason="needs cargo")
+def test_ranks_trade_storage_for_error(tmp_path, monkeypatch):
+    for name, small in {"PICTURE_SIDE": 64, "PICTURE_SPP": 1, "TIMED_SPP": 1}.items():
+        monkeypatch.setattr(ranks, name, small)
+    render.prepare_thread()
+    (scene,) = scenes.find_scenes(ROOT / "mitsuba_scenes", [ranks.SCENE], scene_assets(ROOT / ".cache"))
+    path = tmp_path / "map.exr"
+    support.write_exr(path, (support.random_normals(96, 96, 0.3) + 1) / 2)
+    said = []
+    tool = ROOT / "scripts" / "glints"
+    records = ranks.measure(scene, {"rough": path}, (1, 8), tool, tmp_path / "out", 1, said.append)
+    values = {(record["name"], record["params"]["rank"]): record["value"] for record in records}
+    names = ("precompute", "storage", "ndf_error", "frame_error", "frame_eval_ratio", "frame_sample_ratio")
+    assert set(values) == {(f"tensor/{name}", rank) for name in names for rank in (1, 8)}
+    assert all(math.isfinite(value) and value > 0 for value in values.values())
+    assert values["tensor/ndf_error", 8] < values["tensor/ndf_error", 1] < 1
+    assert values["tensor/storage", 8] > values["tensor/storage", 1]
+    kept = ranks.read(tmp_path / "out")
+    assert kept.records == records and said
+    low, high, truth = (read_exr(kept.folder / item["file"]) for item in kept.pictures)
+    assert [item["rank"] for item in kept.pictures] == [1, 8, ranks.UNCOMPRESSED]
+    # The picture of the higher rank is nearer to the uncompressed one, and its error is the one that is listed.
+    errors = [float(np.mean((image.astype(np.float64) - truth) ** 2)) for image in (low, high)]
+    assert errors == [values["tensor/frame_error", rank] for rank in (1, 8)] and errors[1] < errors[0]

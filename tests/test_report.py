@@ -12,11 +12,12 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from glints_harness import images, metrics, plan
+from glints_harness import images, metrics, plan, ranks
 from glints_harness.methods import METHODS
 from glints_harness.reference import Reference
-from glints_harness.report import animation, pictures, plots, tables, text
+from glints_harness.report import animation, curves, pictures, plots, tables, text
 from glints_harness.report import page as report_page
+from glints_harness.report import ranks as rank_report
 from glints_harness.scenes import View
 from glints_harness.summary import METRICS, ErrorSplit, Estimate, Results, Summary, TemporalResult
 from PIL import Image
@@ -100,6 +101,27 @@ class Builder:
         )
 
 
+def made_ranks(folder):
+    """What a benchmark of ranks wrote: two maps, two ranks and what is not compressed."""
+    records, pictures = [], []
+    for label in ("isotropic", "flakes"):
+        for rank in (2, 16):
+            params = {"map": label, "side": 64, "alpha": 0.007, "rank": rank, "scene": "bent_quad"}
+            for index, name in enumerate(rank_report.QUANTITIES):
+                value = (index + 1) * rank
+                records.append(
+                    {"name": f"tensor/{name}", "value": value, "unit": "", "ratio": value / 4, "params": params}
+                )
+        for rank in (2, 16, ranks.UNCOMPRESSED):
+            file = folder / "pictures" / f"{label}-{rank}.exr"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            mi.Bitmap(picture(len(pictures))).write(str(file))
+            pictures.append({"map": label, "rank": rank, "file": f"pictures/{file.name}"})
+    kept = {"date": "2026-01-02", "plugins": "4567", "machine": {"processor": "Another one", "cores": 3}}
+    (folder / ranks.FILE).write_text(json.dumps({"records": records, "pictures": pictures, "provenance": kept}))
+    return ranks.read(folder)
+
+
 def errors(size, method):
     """Made-up errors, one of them infinite."""
     value = math.inf if method == "normalmap" else size
@@ -152,12 +174,18 @@ def make_results(out):
                 for spp in (16,) if view == "frame" else (1, 4, 16):
                     if view == "frame" or (method, spp) != LEFT_OUT:
                         summaries.append(build.summary(tiling, method, view, spp))
+    references["shoes", 1, "texels", plan.PREFILTERING] = reference(2000, SIDE)
     pixel = build.summary(8, "glints_ibm", "crop1", 1, footprint="pixel")
     left_out = {"scene": "shoes", "tiling": 8, "method": LEFT_OUT[0], "footprint": "sample", "view": "crop1"}
     left_out.update(spp=16, time_budget=None, frame=None, reason="the time limit", predicted_seconds=99.0)
     return Results(
         settings=plan.Settings(
-            scenes=(scene(out),), methods=tuple(METHODS.values()), tilings=TILINGS, size=80, frame_size=FRAME_SIDE
+            scenes=(scene(out),),
+            methods=tuple(METHODS.values()),
+            tilings=TILINGS,
+            size=80,
+            frame_size=FRAME_SIDE,
+            unprepared={"kettle": ("glints_tensor",), "shoes": ()},
         ),
         summaries=[*summaries, pixel],
         records=[],
@@ -183,6 +211,12 @@ def make_results(out):
         exposure=0.0,
         seconds=12.0,
         out=out,
+        prefiltering=[
+            build.summary(1, method, plan.PREFILTERING, spp, footprint="pixel")
+            for method in ("glints_tensor", "glints_tensor_prefiltered")
+            for spp in (1, 64)
+        ],
+        ranks=made_ranks(out / "bench"),
     )
 
 
@@ -300,6 +334,70 @@ def test_a_plot_lists_the_values_of_its_markers_in_their_order(tmp_path):
     group = drawn["svg"].split('id="points-0"')[1].split("</g>")[0]
     places = [float(mark.split('"')[0]) for mark in group.split(' x="')[1:]]
     assert len(places) == 2 and places[0] < places[1]
+
+
+def test_prefiltered_light_is_compared_at_most_samples_and_by_its_noise(written):
+    results, path = written
+    section = report_page.prefiltering(results)
+    plain, prefiltered = "Tensor decomposition", "Tensor decomposition, prefiltered light"
+    titles = [shot["title"] for shot in section["shots"]]
+    truth = results.references["shoes", 1, "texels", plan.PREFILTERING]
+    assert titles == [f"{plain} · pixel, 64 spp", f"{prefiltered} · pixel, 64 spp", f"Reference, {truth.spp} spp"]
+    assert len({shot["uri"] for shot in section["shots"]}) == 3
+    found = curves.prefiltering_plots(results)
+    assert list(found) == ["rmse", "relmse", "noise"]
+    noise = found["noise"].series[1]
+    assert (noise.method, noise.label) == ("glints_tensor_prefiltered", f"{prefiltered} · pixel")
+    assert [(point.x, point.y) for point in noise.points] == [(1, 0.9**0.5), (64, 0.9**0.5)]
+    assert len(section["table"].rows) == 4
+    text = path.read_text(encoding="utf-8")
+    assert 'id="prefiltering"' in text and 'data-plot="prefiltering/noise"' in text
+
+
+def test_plots_and_pictures_of_ranks_come_from_the_last_benchmark(written):
+    results, path = written
+    found = rank_report.rank_plots(results.ranks)
+    assert list(found) == list(rank_report.QUANTITIES)
+    assert [item.label for item in found["precompute"].series] == ["isotropic", "flakes"]
+    assert [(point.x, point.y) for point in found["precompute"].series[0].points] == [(2, 2), (16, 16)]
+    # Storage is plotted as the share of what is not compressed.
+    assert [(point.x, point.y) for point in found["storage"].series[1].points] == [(2, 1.0), (16, 8.0)]
+    section = report_page.rank_section(results)
+    assert [row["map"] for row in section["rows"]] == ["isotropic", "flakes"]
+    assert [shot["title"] for shot in section["rows"][0]["shots"]] == ["rank 2", "rank 16", "not compressed"]
+    assert len({shot["uri"] for row in section["rows"] for shot in row["shots"]}) == 6
+    text = path.read_text(encoding="utf-8")
+    assert "the plugins have changed since" in text and "Another one, 3 cores" in text
+    assert 'data-plot="rank/frame_sample_ratio"' in text
+
+
+def test_what_is_not_precomputed_is_named_with_the_command_that_makes_it(written):
+    text = written[1].read_text(encoding="utf-8")
+    assert "Tensor decomposition: Kettle" in text
+    assert "./scripts/compare --scene kettle --methods glints_tensor" in text
+
+
+def test_without_prefiltering_and_ranks_the_report_has_no_such_sections(written):
+    results = dataclasses.replace(written[0], prefiltering=[], ranks=None)
+    assert curves.prefiltering_plots(results) == {} == rank_report.rank_plots(results.ranks)
+    assert report_page.prefiltering(results) is None and report_page.rank_section(results) is None
+
+
+@pytest.mark.parametrize("damage", ["text", "record", "picture"])
+def test_a_damaged_benchmark_of_ranks_is_named(tmp_path, damage):
+    made_ranks(tmp_path)
+    file = tmp_path / ranks.FILE
+    kept = json.loads(file.read_text())
+    if damage == "text":
+        file.write_text(file.read_text()[:-9])
+    elif damage == "record":
+        kept["records"][0].pop("ratio")
+        file.write_text(json.dumps(kept))
+    else:
+        (tmp_path / kept["pictures"][1]["file"]).unlink()
+    with pytest.raises(ValueError, match=r"ranks\.json: .*; run scripts/bench --only tensor again"):
+        ranks.read(tmp_path)
+    assert ranks.read(tmp_path / "nowhere") is None
 
 
 def test_the_animation_has_every_frame(written):

@@ -179,6 +179,48 @@ def test_a_sparse_method_has_few_points_unless_it_is_named(mini, tmp_path):
     assert any(run.view.frame is not None for run in runs)
 
 
+PAIR = ("glints_tensor", "glints_tensor_prefiltered")
+
+
+def test_a_method_that_waits_for_its_precomputation_is_left_out(mini, tmp_path):
+    chosen = settings(mini, tmp_path, ("normalmap", "glints_tensor"))
+    assert {run.method for run in plan.RunPlan(chosen).runs} == {"normalmap", "glints_tensor"}
+    waiting = replace(chosen, unprepared={"mini": ("glints_tensor",), "other": ("normalmap",)})
+    assert {run.method for run in plan.RunPlan(waiting).runs} == {"normalmap"}
+
+
+def test_environment_light_is_compared_with_and_without_prefiltering(mini, tmp_path):
+    chosen = settings(mini, tmp_path, ("normalmap", *PAIR))
+    mine = plan.RunPlan(chosen).prefiltering
+    assert {(run.method, run.lighting.environment_prefilter) for run in mine} == {(PAIR[0], False), (PAIR[1], True)}
+    assert {(run.lighting.footprint, run.view.name) for run in mine} == {("pixel", plan.PREFILTERING)}
+    assert {run.spp for run in mine} == set(plan.PREFILTERING_SPPS) and max(plan.PREFILTERING_SPPS) == 64
+    main = [run for run in plan.RunPlan(chosen).main if run.method == PAIR[1]]
+    assert main and all(run.lighting.environment_prefilter for run in main)
+    (key,) = {key for key, _ in plan.references(chosen) if key.view.name == plan.PREFILTERING}
+    assert key.view == mine[0].view and key.surface == "texels"
+    comparison = Comparison(chosen, executors.Local(), Silent(), {})
+    assert comparison.reference_spp(key) == 4096 > comparison.reference_spp(replace(key, view=CROP)) == 8
+    assert not comparison.reference_lighting(key).environment_prefilter
+
+
+@pytest.mark.parametrize("names", [PAIR[:1], PAIR[1:], ("glints_ibm", PAIR[1])])
+def test_prefiltering_is_compared_with_the_same_method_alone(mini, tmp_path, names):
+    chosen = settings(mini, tmp_path, names)
+    assert chosen.prefiltering() is None and plan.RunPlan(chosen).prefiltering == []
+
+
+def test_without_environment_light_there_is_nothing_to_prefilter(mini, tmp_path):
+    dark = scenes.Scene("dark", tmp_path / "dark.xml", mini.values, mini.crops)
+    text = mini.path.read_text(encoding="utf-8")
+    emitter = '<emitter type="constant"><float name="radiance" value="0.2"/></emitter>'
+    assert emitter in text and mini.has_environment
+    dark.path.write_text(text.replace(emitter, ""), encoding="utf-8")
+    assert not dark.has_environment and settings(dark, tmp_path, PAIR).prefiltering() is None
+    both = replace(settings(mini, tmp_path, PAIR), scenes=(dark, mini))
+    assert both.prefiltering()[0] is mini
+
+
 class Once(executors.Local):
     """Leaves every point of more than one sample out in its first pass, as a time limit would, and notes all jobs."""
 

@@ -1,11 +1,12 @@
 """The project's own scenes: their maps and meshes, what their crops show, and how they are compared."""
 
+import dataclasses
 import json
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from glints_harness import plan, render, scenes, tables
+from glints_harness import cli, plan, render, scenes, tables
 from glints_harness.cli import ROOT, scene_assets
 from glints_harness.methods import METHODS, choose
 from glints_harness.report import text
@@ -257,6 +258,20 @@ def test_names_of_scenes_for_people():
     assert text.case_title("wing_mirror", 8) == "Wing mirror ×8"
     assert tables.counts_text({"shoes": 4, "kettle": 4}) == "4 spp"
     assert tables.counts_text({"shoes": 4, "kettle": 4, "car_wheel": 1}) == "4 spp (shoes, kettle), 1 spp (car_wheel)"
+
+
+def test_a_precomputed_method_waits_in_the_scenes_that_have_it_alone(project_scenes, tmp_path):
+    found = [scene for scene in all_scenes() if scene.name in ("wing_mirror", "bent_quad")]
+    found = [dataclasses.replace(project_scenes[scene.name], reduced=scene.reduced) for scene in found]
+    methods = [dataclasses.replace(METHODS["glints_tensor"], store=tmp_path), METHODS["glints_ibm"]]
+    absent = cli.unprepared(found, methods)
+    assert absent == {"bent_quad": ("glints_tensor",), "wing_mirror": ()}
+    assert [cli.takes_part(method, found, absent) for method in methods] == [False, True]
+    kept = methods[0].precomputation(found[0].first_slot())
+    kept.mkdir()
+    (kept / "tensor.glints").touch()
+    assert cli.unprepared(found, methods) == {"bent_quad": (), "wing_mirror": ()}
+    assert cli.takes_part(methods[0], found, cli.unprepared(found, methods))
 
 
 def test_a_scene_that_is_named_is_compared_in_full():

@@ -1,7 +1,7 @@
 """Command line of `scripts/bench`: memory and speed of the methods, against each other and stock Mitsuba, in one run.
 
-Three sources: the Rust library's own benchmark (structures and queries), a C++ timer (the same queries through
-Mitsuba's BSDF interface, beside stock `roughconductor`), and whole frames.
+Four sources: the Rust library's own benchmark (structures and queries), a C++ timer (the same queries through
+Mitsuba's BSDF interface, beside stock `roughconductor`), whole frames, and tensor decompositions by rank (`ranks`).
 """
 
 import argparse
@@ -15,11 +15,12 @@ from pathlib import Path
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from . import provenance, render, timer
-from .cli import ROOT, number, numbers, scene_assets
+from . import provenance, ranks, render, timer
+from .cli import ROOT, generator, number, numbers, scene_assets
 from .files import write_json
 from .methods import METHODS
 from .progress import Display, console
+from .records import make_record
 from .render import Lighting, LoadedScene
 from .scenes import FULL_SIZE, find_scenes
 
@@ -114,19 +115,6 @@ def target(record):
     if name == "frame" and full and params["method"] == "glints_ibm" and record["baseline"].startswith("normalmap"):
         return "≤ 2×", ratio <= 2
     return None
-
-
-def make_record(name, value, unit, baseline, baseline_value, params):
-    """A line of bench.json."""
-    return {
-        "name": name,
-        "value": value,
-        "unit": unit,
-        "baseline": baseline,
-        "baseline_value": baseline_value,
-        "ratio": value / baseline_value,
-        "params": params,
-    }
 
 
 def rust_records(maps, quick, sides, say):
@@ -298,6 +286,17 @@ def compare_frames(scene, frames):
     return records
 
 
+def tensor_records(options, assets, say):
+    """The records of tensor decompositions by rank; they and their pictures are kept in OUT/tensor for `scripts/compare`."""
+    (scene,) = find_scenes(ROOT / "mitsuba_scenes", [ranks.SCENE], assets)
+    side = options.tensor_side or (ranks.QUICK_SIDE if options.quick else ranks.SIDE)
+    made = generator().ensure_assets(options.cache / "scenes", side, log=say)["maps"]
+    maps = {label: made[label] for label in ranks.MAPS}
+    chosen = ranks.QUICK_RANKS if options.quick else ranks.RANKS
+    repeats = options.repeats or (1 if options.quick else 5)
+    return ranks.measure(scene, maps, chosen, ROOT / "scripts" / "glints", options.out / "tensor", repeats, say)
+
+
 def readable(value, unit):
     """A value with its unit for people."""
     if value is None:
@@ -365,7 +364,12 @@ def parser():
         help="sides in texels of further maps whose memory is counted: the scenes' cropped or tiled, 16 B a texel and more "
         "while they are built (default: 1024,4096, with --quick none)",
     )
-    add("--only", choices=("rust", "plugins", "frames"), help="one of the three sources")
+    add("--only", choices=("rust", "plugins", "frames", "tensor"), help="one of the four sources")
+    add(
+        "--tensor-side",
+        type=number(int),
+        help=f"texels a side of the maps of tensor decompositions (default: {ranks.SIDE}, with --quick {ranks.QUICK_SIDE})",
+    )
     add("--scene-dir", type=Path, default=ROOT / "mitsuba_scenes", help="folder of scene files with a glint slot")
     add("--max-depth", type=number(int), default=2, help="longest path of the frames (default: %(default)s, direct)")
     add("--repeats", type=number(int), help="renderings of a frame (default: 3, with --quick 1)")
@@ -394,6 +398,8 @@ def main(arguments=None):
             size = options.res or (200 if options.quick else FULL_SIZE)
             repeats = options.repeats or (1 if options.quick else 3)
             records += frame_records(scenes, size, repeats, Lighting(max_depth=options.max_depth), display)
+        if options.only in (None, "tensor"):
+            records += tensor_records(options, assets, display.say)
     print_tables(records)
     write_json(options.out / "bench.json", records)
     write_json(options.out / "provenance.json", provenance.provenance())

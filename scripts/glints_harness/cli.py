@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from . import render, tables
+from . import ranks, render, tables
 from .compare import Comparison
 from .executors import START_WORKERS, Dask, Local
 from .methods import METHODS, SURFACES, check_plugins, choose
@@ -117,6 +117,12 @@ def parser():
     where("--dask", metavar="SCHEDULER_ADDRESS", help="render on the workers of an existing Dask cluster")
     where("--out", type=Path, default=ROOT / "out" / "compare", help="folder of the report")
     where("--cache", type=Path, default=ROOT / ".cache", help="folder of finished runs, references, generated scenes")
+    where(
+        "--bench",
+        type=Path,
+        default=ROOT / "out" / "bench",
+        help="folder of scripts/bench, whose plots over rank are shown",
+    )
     where("--fresh", action="store_true", help="render again what is kept of the runs")
     where("--no-report", action="store_true", help="write results.json, results.csv and the images only")
     where("--exposure", type=float, default=0.0, help="stops, for the pictures only (default: 0)")
@@ -209,12 +215,15 @@ def generator():
 def settings(options):
     """The `Settings` that the options ask for."""
     check_options(options)
-    methods = tuple(METHODS.values() if options.methods is None else choose(options.methods.split(",")))
+    methods = chosen_methods(options)
     check_plugins((*methods, *(SURFACES[method.surface] for method in methods)))
     limited = not (options.spp or options.time or options.time_with_build or options.dask)
+    found = tuple(find_scenes(options.scene_dir, options.scene.split(","), scene_assets(options.cache)))
+    absent = unprepared(found, methods)
     return Settings(
-        scenes=tuple(find_scenes(options.scene_dir, options.scene.split(","), scene_assets(options.cache))),
-        methods=methods,
+        scenes=found,
+        methods=tuple(method for method in methods if takes_part(method, found, absent)),
+        unprepared=absent,
         tilings=options.tiling,
         spps=options.spp or (() if options.time or options.time_with_build else DEFAULT_SPPS),
         times=options.time or (DEFAULT_TIMES if limited else ()),
@@ -236,6 +245,40 @@ def settings(options):
         out=options.out,
         cache=options.cache,
     )
+
+
+def chosen_methods(options):
+    """The methods that the options name, or all that the integrator can render."""
+    path = options.integrator == "glints_path"
+    if options.methods is None:
+        methods = [method for method in METHODS.values() if path or not method.environment_prefilter]
+    else:
+        methods = choose(options.methods.split(","))
+    wrong = [method.name for method in methods if method.environment_prefilter and not path]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)} needs the integrator glints_path; leave out --integrator")
+    return tuple(
+        replace(method, store=options.cache / "precomputed") if method.precomputed else method for method in methods
+    )
+
+
+def unprepared(found, methods):
+    """Name of a scene to the names of methods that wait for a precomputation there, as in `Settings`."""
+    return {
+        scene.name: tuple(
+            method.name
+            for method in methods
+            if method.if_kept and scene.has_method(method.name) and not method.is_kept(scene.first_slot())
+        )
+        for scene in found
+    }
+
+
+def takes_part(method, found, absent):
+    """Whether a method that may be left out is compared in any of the scenes."""
+    if not method.if_kept:
+        return True
+    return any(scene.has_method(method.name) and method.name not in absent[scene.name] for scene in found)
 
 
 def check_options(options):
@@ -261,13 +304,16 @@ def main(arguments=None):
     warnings = render.start()
     try:
         chosen = settings(options)
+        kept_ranks = ranks.read(options.bench / "tensor")
         place = executor(options, chosen, warnings)
     except ValueError as error:
         sys.exit(f"compare: {error}")
     try:
         with Display() as display:
             results = Comparison(chosen, place, display, warnings).run()
-            results = replace(results, exposure=options.exposure, seconds=time.perf_counter() - start)
+            results = replace(
+                results, exposure=options.exposure, ranks=kept_ranks, seconds=time.perf_counter() - start
+            )
             written = results.out / "results.json"
             if not options.no_report:
                 display.say("report")
@@ -277,6 +323,10 @@ def main(arguments=None):
     console.print(tables.cost_table(results), *tables.ratio_lines(results), sep="\n")
     if results.left_out:
         console.print(f"{len(results.left_out)} points did not fit the time and were left out; the report lists them.")
+    for methods, scenes, command in tables.unprepared(chosen):
+        console.print(
+            f"Left out of {', '.join(scenes)}: {', '.join(methods)}, not precomputed yet (minutes): {command}"
+        )
     said = f"{time.perf_counter() - start:.0f} s. {'Results' if options.no_report else 'Report'}: {written.resolve()}"
     console.print(said, soft_wrap=True, highlight=False)
 

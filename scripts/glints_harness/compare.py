@@ -14,7 +14,16 @@ from . import measure, provenance, structures, temporal
 from .files import Damaged, duplicate, write_csv, write_exr, write_json
 from .jobs import LOAD_SECONDS, LeftOut, Part, ReferenceJob, RenderJob, Wanted
 from .methods import SURFACES
-from .plan import ReferenceKey, RunPlan, Settings, Texts, is_measured, references
+from .plan import (
+    PREFILTERING,
+    PREFILTERING_REFERENCE_SPP,
+    ReferenceKey,
+    RunPlan,
+    Settings,
+    Texts,
+    is_measured,
+    references,
+)
 from .reference import Reference, ReferenceStore
 from .render import STRUCTURE
 from .runs import RunCache, description
@@ -69,6 +78,7 @@ class Comparison:
             },
             sweep=measure.of_points(found, self.plan.sweep),
             temporal=temporal.results(self),
+            prefiltering=measure.of_points(found, self.plan.prefiltering),
             table_4=structures.of_table_4(self.settings),
             left_out=[item.record() for item in self.left_out],
             provenance=provenance.provenance(),
@@ -156,7 +166,7 @@ class Comparison:
         for key, share in references(settings):
             kept = self.recover(self.store.find, self.describe_reference(key)) or Reference.empty(key.view)
             lighting, seconds = self.reference_lighting(key), settings.reference_seconds * share
-            wanted = Wanted(key, lighting, kept, seconds, settings.reference_spp)
+            wanted = Wanted(key, lighting, kept, seconds, self.reference_spp(key))
             self.references[key] = kept
             if not wanted.complete:
                 groups.setdefault((key.scene, key.tiling, key.surface), []).append(wanted)
@@ -166,6 +176,11 @@ class Comparison:
         """The job of one group."""
         text, _ = self.texts.of(self.settings.scene(scene), SURFACES[surface], tiling)
         return ReferenceJob(f"{scene} x{tiling:g}: reference ({surface})", text, tuple(wanted))
+
+    def reference_spp(self, key):
+        """Least samples per pixel of a reference, or None: then it has a least rendering time."""
+        spp = self.settings.reference_spp
+        return max(spp or 0, PREFILTERING_REFERENCE_SPP) if key.view.name == PREFILTERING else spp
 
     def reference_lighting(self, key):
         """The integrator of a reference: that of the runs that are held against it."""
@@ -251,6 +266,7 @@ class Comparison:
                 "provenances": self.provenances,
                 "summaries": [listed(summary) for summary in results.summaries],
                 "sweep": [listed(summary) for summary in results.sweep],
+                "prefiltering": [listed(summary) for summary in results.prefiltering],
                 "table_4": [
                     {"scene": scene, "method": method, "alpha": alpha, **item}
                     for (scene, method, alpha), item in results.table_4.items()
@@ -258,6 +274,7 @@ class Comparison:
                 "temporal": [asdict(item) for item in results.temporal],
                 "references": [self.listed_reference(*item) for item in self.references.items()],
                 "left_out": results.left_out,
+                "unprepared": {scene: list(names) for scene, names in self.settings.unprepared.items()},
                 "warnings": results.warnings,
                 "provenance": results.provenance,
                 "seconds": results.seconds,

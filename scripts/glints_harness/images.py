@@ -6,6 +6,9 @@ import zlib
 
 import mitsuba as mi
 import numpy as np
+from PIL import Image
+
+from .files import replacing
 
 INVALID_COLOUR = (255, 0, 255)
 """Colour of infinite and undefined pixels."""
@@ -73,6 +76,13 @@ def residual(plane):
 def pack_unit(values):
     """Numbers of [0, 1] (height, width) as base64 text of 8 bits each, deflated."""
     return deflated(np.round(np.asarray(values) * 255).astype(np.uint8).tobytes())
+
+
+def picture_uri(file, image, exposure=0.0):
+    """Write a linear image as PNG, whole or not at all; returns it as a URI."""
+    with replacing(file) as temporary:
+        Image.fromarray(tone_map(image, exposure)).save(temporary)
+    return data_uri(file)
 
 
 def deflated(data):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ from xml.etree import ElementTree as xml
 import mitsuba as mi
 
 from . import maps
+from .files import digest_file, digest_text
 
 GLINTS = "glints"
 """Reflectance model of this project's plugins (Eq. 4 and 5 of the 2021 paper). The references have it, too."""
@@ -74,15 +76,35 @@ class Method:
     """Whether it is rendered at few points only, unless it is asked for by name: the crops at the first sample count and
     at equal time, with one footprint rule."""
     note: str = ""
+    environment_prefilter: bool = False
+    """Whether `glints_path` has it answer for environment light over directions, too, and not only over the footprint."""
+    precomputed: bool = False
+    """Whether its data structure takes minutes to make, and is kept in a folder of `store`."""
+    store: Path | None = None
+    """Where precomputations are kept; None: where the plugin keeps them by itself."""
+    if_kept: bool = False
+    """Whether it is left out of scenes whose precomputation is not kept yet, unless it is asked for by name."""
 
     def element(self, slot):
         """The BSDF element that takes the slot's place, with the slot's identity so that shapes still find it."""
         element = self.fill(slot, self.parameters)
+        if self.precomputed and self.store is not None:
+            add_property(element, "cache", str(self.precomputation(slot)))
         for key in ("id", "name"):
             element.attrib.pop(key, None)
             if key in slot.element.attrib:
                 element.set(key, slot.element.get(key))
         return element
+
+    def precomputation(self, slot):
+        """The folder of the slot's precomputation, named by all that decides it: the map's content and parameters."""
+        decisive = [*self.plugins, digest_file(slot.filename), slot.alpha, dict(self.parameters)]
+        return self.store.resolve() / digest_text(json.dumps(decisive, sort_keys=True))[:24]
+
+    def is_kept(self, slot):
+        """Whether the slot's precomputation is there already: a file that is no unfinished one (these begin with a dot)."""
+        folder = self.precomputation(slot)
+        return folder.is_dir() and any(path.is_file() and path.name[0] != "." for path in folder.iterdir())
 
 
 def keep(slot, _parameters):
@@ -159,6 +181,12 @@ CURVED_MEMORY = Formula(
     "30 r² N: r² elements a texel, with their tree", lambda texels, _bins, refinement: 30 * refinement**2 * texels
 )
 
+TENSOR = {"filters": True, "precomputed": True, "if_kept": True}
+TENSOR_NOTE = (
+    "Its precomputation takes minutes for a large map and is kept; build times of later runs are those of loading it. Its "
+    "footprint is a Gaussian of half a pixel's deviation, as that of Yan et al., so it blurs more than a box."
+)
+
 METHODS = {
     method.name: method
     for method in (
@@ -201,6 +229,16 @@ METHODS = {
             note="Curved elements interpolate the map, and are measured against the interpolated surface.",
         ),
         glints("glints_direct", "Direct sum", "glints_direct", NORMALS_MEMORY, filters=True),
+        glints("glints_tensor", "Tensor decomposition", "glints_tensor", None, note=TENSOR_NOTE, **TENSOR),
+        glints(
+            "glints_tensor_prefiltered",
+            "Tensor decomposition, prefiltered light",
+            "glints_tensor",
+            None,
+            environment_prefilter=True,
+            note="Prefiltered light: a sample of environment light stands for a range of directions, and so does the answer.",
+            **TENSOR,
+        ),
         glints("glints_unfiltered", "Unfiltered", "glints_unfiltered", NORMALS_MEMORY),
         Method(
             "normalmap",
@@ -243,11 +281,11 @@ it does on purpose.
 
 
 def choose(names):
-    """The methods of these names, in this order; a method that is named is not sparse."""
+    """The methods of these names, in this order; a method that is named is not sparse, and is precomputed if need be."""
     unknown = [name for name in names if name not in METHODS]
     if unknown:
         raise ValueError(f"unknown method {', '.join(unknown)}; there are {', '.join(METHODS)}")
-    return [replace(METHODS[name], sparse=False) for name in dict.fromkeys(names)]
+    return [replace(METHODS[name], sparse=False, if_kept=False) for name in dict.fromkeys(names)]
 
 
 def check_plugins(methods):

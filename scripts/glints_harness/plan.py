@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,6 +18,16 @@ SWEEP_SPP = 1
 
 SEQUENCE_SPP = 4
 """Samples per pixel of the temporal sequence."""
+
+PREFILTERING = "prefiltering"
+"""Name of the view on which environment light is compared with and without prefiltering."""
+
+PREFILTERING_SIDE = 40
+"""Pixels a side of that view, the middle of the first crop."""
+
+PREFILTERING_SPPS = (1, 4, 16, 64)
+PREFILTERING_REFERENCE_SPP = 4096
+"""Samples per pixel there, up to those of Figure 11 of the 2022 paper, and of its reference."""
 
 MINOR_SHARE = 1 / 3
 SEQUENCE_SHARE = 1 / 5
@@ -65,16 +75,19 @@ class Settings:
     """Seconds for the whole comparison; None: no limit. Points that are predicted not to fit are left out."""
     fresh: bool = False
     """Whether to render again what is kept."""
+    unprepared: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Name of a scene to names of methods that are left out of it, since their precomputation is not kept yet."""
     out: Path = Path("out/compare")
     cache: Path = Path(".cache")
     """Folder of finished runs and references."""
 
     def of(self, scene):
         """These settings as far as they hold for one scene: fewer where it is reduced."""
-        reduced = scene.reduced
+        reduced, unprepared = scene.reduced, self.unprepared.get(scene.name, ())
+        methods = tuple(method for method in self.methods if method.name not in unprepared)
         if reduced is None:
-            return self
-        methods = tuple(method for method in self.methods if method.name in reduced.methods)
+            return replace(self, methods=methods)
+        methods = tuple(method for method in methods if method.name in reduced.methods)
         return replace(
             self,
             methods=methods,
@@ -91,10 +104,11 @@ class Settings:
         """(scene, tiling) of everything that is compared."""
         return [(scene, tiling) for scene in self.scenes for tiling in self.of(scene).tilings]
 
-    def lighting_of(self, scene, view, rule="none"):
-        """The integrator of a view of a scene, with a footprint rule."""
+    def lighting_of(self, scene, view, method=None, rule="none"):
+        """The integrator of a view of a scene, for a method (None: a reference) with a footprint rule."""
         depth = max(scene.max_depth, self.frame_depth if is_frame(view) else self.lighting.max_depth)
-        return replace(self.lighting, max_depth=depth, footprint=rule)
+        prefilter = method is not None and method.environment_prefilter
+        return replace(self.lighting, max_depth=depth, footprint=rule, environment_prefilter=prefilter)
 
     def rules(self, method):
         """The footprint rules that a method is run with."""
@@ -124,6 +138,26 @@ class Settings:
         crop = crop.middle(max(1, crop.crop[2] // 2))
         step = self.orbit / max(1, self.frames - 1)
         return [replace(crop, frame=index, turn=index * step) for index in range(self.frames)]
+
+    def prefiltering(self):
+        """(scene, tiling, view, methods) of the comparison of environment light with and without prefiltering, or None.
+
+        It takes the first scene that has such light and a method in both forms.
+        """
+        for scene, tiling in self.cases:
+            methods = self.of(scene).methods
+            pairs = [
+                (plain, method)
+                for method in methods
+                if method.environment_prefilter
+                for plain in methods
+                if not plain.environment_prefilter
+                and (plain.plugins, plain.parameters) == (method.plugins, method.parameters)
+            ]
+            if pairs and scene.has_environment:
+                view = replace(self.first_crop(scene).middle(PREFILTERING_SIDE), name=PREFILTERING)
+                return scene, tiling, view, pairs[0]
+        return None
 
     def method(self, name):
         """The method of a name."""
@@ -166,7 +200,7 @@ class Texts:
 
 
 class RunPlan:
-    """Every run, as lists of three purposes that may share runs; points stand by falling importance."""
+    """Every run, as lists of four purposes that may share runs; points stand by falling importance."""
 
     def __init__(self, settings):
         self.settings = settings
@@ -179,6 +213,7 @@ class RunPlan:
         for method in methods:
             if method.surface == "texels":
                 self.sequence += self.sequence_runs(first, method)
+        self.prefiltering = self.prefiltering_runs()
         for tiling in settings.sweep:
             for method in methods:
                 self.sweep += self.sweep_runs(first, tiling, method)
@@ -186,7 +221,7 @@ class RunPlan:
     @property
     def runs(self):
         """All of them, each once."""
-        return list(dict.fromkeys((*self.main, *self.sequence, *self.sweep)))
+        return list(dict.fromkeys((*self.main, *self.sequence, *self.prefiltering, *self.sweep)))
 
     def main_runs(self, scene, tiling, method):
         """Few samples in the crops, the frame, equal time, more samples."""
@@ -198,7 +233,14 @@ class RunPlan:
 
         def run(view, rule, spp, seed, **more):
             return Run(
-                scene.name, tiling, method.name, view, settings.lighting_of(scene, view, rule), spp, seed, **more
+                scene.name,
+                tiling,
+                method.name,
+                view,
+                settings.lighting_of(scene, view, method, rule),
+                spp,
+                seed,
+                **more,
             )
 
         def crop_runs(spp=None, **more):
@@ -224,7 +266,15 @@ class RunPlan:
         """The first crop at one sample count."""
         crop = self.settings.first_crop(scene)
         return [
-            Run(scene.name, tiling, method.name, crop, self.settings.lighting_of(scene, crop, rule), SWEEP_SPP, seed)
+            Run(
+                scene.name,
+                tiling,
+                method.name,
+                crop,
+                self.settings.lighting_of(scene, crop, method, rule),
+                SWEEP_SPP,
+                seed,
+            )
             for rule in self.settings.rules(method)
             for seed in self.seeds()
         ]
@@ -238,12 +288,33 @@ class RunPlan:
                 tiling,
                 method.name,
                 view,
-                settings.lighting_of(scene, view, rule),
+                settings.lighting_of(scene, view, method, rule),
                 SEQUENCE_SPP,
                 FIRST_SEED + view.frame,
             )
             for rule in settings.rules(method)
             for view in settings.sequence(scene, tiling)
+        ]
+
+    def prefiltering_runs(self):
+        """Both methods, with the same footprint at every sample count."""
+        case = self.settings.prefiltering()
+        if case is None:
+            return []
+        scene, tiling, view, methods = case
+        return [
+            Run(
+                scene.name,
+                tiling,
+                method.name,
+                view,
+                self.settings.lighting_of(scene, view, method, "pixel"),
+                spp,
+                seed,
+            )
+            for method in methods
+            for spp in PREFILTERING_SPPS
+            for seed in self.seeds()
         ]
 
 
@@ -287,6 +358,9 @@ def references(settings):
         wanted[ReferenceKey(scene.name, tiling, "texels", frame)] = MINOR_SHARE
         for view in settings.sequence(scene, tiling):
             wanted[ReferenceKey(scene.name, tiling, "texels", view)] = SEQUENCE_SHARE
+    if case := settings.prefiltering():
+        scene, tiling, view, methods = case
+        wanted[ReferenceKey(scene.name, tiling, methods[0].surface, view)] = SEQUENCE_SHARE
     first = settings.scenes[0]
     for tiling in settings.sweep if "texels" in surfaces_of(settings.of(first).methods) else ():
         wanted.setdefault(ReferenceKey(first.name, tiling, "texels", settings.first_crop(first)), MINOR_SHARE)

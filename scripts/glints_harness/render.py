@@ -24,6 +24,8 @@ class Lighting:
     footprint: str = "sample"
     """`sample`: ray differentials shrink with the square root of the sample count; `pixel`; a number of pixels; or
     `none` where the method doesn't look at it."""
+    environment_prefilter: bool = False
+    """Whether samples of environment light stand for a range of directions. For `glints_path` only."""
 
     def load(self):
         """The Mitsuba integrator. Only `glints_path` knows the footprint rule, and only `direct` knows no depth."""
@@ -32,6 +34,8 @@ class Lighting:
             described["max_depth"] = self.max_depth
         if self.integrator == "glints_path" and self.footprint != "none":
             described["footprint"] = self.footprint
+        if self.environment_prefilter:
+            described["environment_prefilter"] = True
         return mi.load_dict(described)
 
 

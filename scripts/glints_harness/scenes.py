@@ -128,6 +128,16 @@ class Scene:
         """Number of texels of the normal map."""
         return maps.texels(self.normal_map)
 
+    @property
+    def has_environment(self):
+        """Whether light comes from all around, from an image or a constant one."""
+        emitters = self.resolved(1).iter("emitter")
+        return any(emitter.get("type") in ("envmap", "constant") for emitter in emitters)
+
+    def has_method(self, name):
+        """Whether the scene is compared with a method at all; a reduced one has few."""
+        return self.reduced is None or name in self.reduced.methods
+
     def first_slot(self):
         """The first glint slot, with parameters put in."""
         return slots(self.resolved(1))[0][1]
@@ -206,8 +216,14 @@ def fill_slots(root, method):
 
 
 def scene_digest(text):
-    """Digest of a resolved scene: its text, with the content of every file in place of the file's name."""
+    """Digest of a resolved scene: its text, with the content of every file in place of the file's name.
+
+    Where a plugin keeps what it precomputes (`cache`) decides nothing.
+    """
     root = xml.fromstring(text)
+    for parent in list(root.iter("bsdf")):
+        for element in parent.findall("string[@name='cache']"):
+            parent.remove(element)
     for element in root.iter():
         if element.get("name") == "filename" and Path(element.get("value", "")).is_file():
             element.set("value", digest_file(element.get("value")))

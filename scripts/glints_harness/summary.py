@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 METRICS = ("rmse", "relmse", "smape", "flip", "mean_error")
@@ -154,6 +154,10 @@ class Results:
     seconds: float
     """Wall-clock seconds so far."""
     out: Path
+    prefiltering: list = field(default_factory=list)
+    """Summaries of the comparison of environment light with and without prefiltering."""
+    ranks: object = None
+    """`ranks.Ranks` of the last benchmark, if there is one."""
 
 
 def select(summaries, **wanted):

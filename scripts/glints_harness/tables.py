@@ -11,6 +11,21 @@ from .summary import common_spp, select
 FLAT = "glints_yan16_flat"
 
 
+def unprepared(settings):
+    """(methods, scenes, command that makes it), as names, of what was left out since its precomputation is not kept."""
+    scenes = {}
+    for scene, methods in settings.unprepared.items():
+        for method in methods:
+            scenes.setdefault(method, []).append(scene)
+    groups = {}
+    for method, names in scenes.items():
+        groups.setdefault(tuple(names), []).append(method)
+    return [
+        (methods, names, f"./scripts/compare --scene {','.join(names)} --methods {methods[0]}")
+        for names, methods in groups.items()
+    ]
+
+
 def cost_table(results):
     """Build time, memory, times and errors by scene, tiling, method and footprint rule."""
     counts = {scene.name: count_of(results, scene.name) for scene in results.settings.scenes}

@@ -113,6 +113,41 @@ def sweep_plots(results):
     return found
 
 
+def prefiltering_plots(results):
+    """{quantity: `Plot`} of environment light with and without prefiltering over samples per pixel: errors, and the
+    noise alone, as the root of the variance over seeds."""
+    shown = [item for item in results.prefiltering if item.errors]
+    if not shown:
+        return {}
+    first = shown[0]
+    quantities = {
+        "rmse": ("RMSE (radiance)", lambda item: error_point(item, "rmse", "spp")),
+        "relmse": ("relative MSE", lambda item: error_point(item, "relmse", "spp")),
+        "noise": ("standard deviation over seeds (radiance)", noise_point),
+    }
+    return {
+        quantity: plots.Plot(
+            name=f"prefiltering-{quantity}-over-spp",
+            title=f"{case_title(first.scene, first.tiling)}, middle of crop 1",
+            x_label=AXES["spp"],
+            y_label=label,
+            series=curves(shown, point),
+            x_base=2,
+            noise=None if quantity == "noise" else first.errors[quantity].noise,
+        )
+        for quantity, (label, point) in quantities.items()
+        if quantity != "noise" or all(item.errors["rmse"].variance for item in shown)
+    }
+
+
+def noise_point(item):
+    """The root of the variance of one image over its samples per pixel."""
+    variance = item.errors["rmse"].variance
+    value, low, high = (max(0.0, part) ** 0.5 for part in (variance.value, variance.low, variance.high))
+    text = f"{short_label(item)}\n{sample_text(item)}, {len(item.runs)} seeds\nstandard deviation {number(value)}"
+    return plots.Point(item.spp, value, low, high, text)
+
+
 def time_point(item):
     """Microseconds per sample over the tiling."""
     estimate = item.us_per_sample

@@ -12,9 +12,10 @@ from markupsafe import Markup
 from .. import flip, images, metrics, paper
 from ..files import json_ready, write_text
 from ..summary import select
-from . import animation, curves, pictures, plots, tables, workers
+from ..tables import unprepared
+from . import animation, curves, pictures, plots, ranks, tables, workers
 from .curves import AXES, METRIC_TITLES
-from .text import case_id, case_title, long_label, number, scene_title, short_label
+from .text import case_id, case_title, long_label, method_label, number, scene_title, short_label
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -23,6 +24,9 @@ SCRIPTS = ("report_data.js", "report_colour.js", "report_viewer.js", "report_pag
 
 COLOUR_TABLES = {"inferno": "inferno", "magma": "magma", "signed": "RdBu_r"}
 """The page's names of matplotlib's colour tables."""
+
+KINDS = ("sweep", "prefiltering", "rank")
+"""What plots outside of the scenes' own sections are of: the beginning of their identifiers."""
 
 SCHEME = {
     plots.INK: "currentColor",
@@ -54,7 +58,13 @@ def write(results):
         axes=AXES,
         figure=[figure_row(results, gallery, chosen, scene, tiling) for scene, tiling in results.settings.cases],
         **page_tables(results),
-        sweep_plots=[identity for identity in chosen if identity.startswith("sweep/")],
+        **{f"{kind}_plots": [identity for identity in chosen if identity.startswith(f"{kind}/")] for kind in KINDS},
+        prefiltering=prefiltering(results),
+        unprepared=[
+            {"labels": map(method_label, methods), "scenes": map(scene_title, scenes), "command": command}
+            for methods, scenes, command in unprepared(results.settings)
+        ],
+        ranks=rank_section(results),
         largest_tiling=max((item.tiling for item in results.sweep), default=1),
         sequences=sequences,
         css=Markup((TEMPLATES / "report.css").read_text(encoding="utf-8")),
@@ -111,6 +121,8 @@ def all_plots(results):
     found = {f"plot/{'/'.join(key)}": plot for key, plot in curves.convergence_plots(results).items()}
     found.update({f"sweep/{'/'.join(key)}": plot for key, plot in curves.sweep_plots(results).items()})
     found.update({f"trace/{case}": plot for case, plot in curves.trace_plots(results).items()})
+    found.update({f"prefiltering/{key}": plot for key, plot in curves.prefiltering_plots(results).items()})
+    found.update({f"rank/{key}": plot for key, plot in ranks.rank_plots(results.ranks).items()})
     return found
 
 
@@ -226,6 +238,42 @@ def error_cases(results):
             }
         )
     return cases
+
+
+def prefiltering(results):
+    """Figure 11 of the 2022 paper: pictures of the most samples, and all numbers; None where it was not compared."""
+    shown = [item for item in results.prefiltering if item.errors]
+    if not shown:
+        return None
+    first, most = shown[0], max(item.spp for item in shown)
+    key = (first.scene, first.tiling, first.surface, first.view)
+    truth = results.references[key]
+    panels = [(f"{short_label(item)}, {item.spp} spp", images.read_exr(results.out / item.image)) for item in shown]
+    panels = [panel for panel, item in zip(panels, shown) if item.spp == most]
+    panels.append((f"Reference, {truth.spp} spp", truth.mean))
+    folder = results.out / "plots"
+    return {
+        "title": case_title(first.scene, first.tiling),
+        "shots": [
+            {"title": title, "uri": images.picture_uri(folder / f"prefiltering-{index}.png", image, results.exposure)}
+            for index, (title, image) in enumerate(panels)
+        ],
+        "table": tables.prefiltering_table(results),
+    }
+
+
+def rank_section(results):
+    """Figures 18 to 20 of the 2022 paper from the last benchmark; None without one."""
+    if results.ranks is None:
+        return None
+    kept = results.ranks.provenance
+    return {
+        "date": kept["date"],
+        "processor": f"{kept['machine']['processor']}, {kept['machine']['cores']} cores",
+        "same_plugins": kept["plugins"] == results.provenance["plugins"],
+        "rows": ranks.rank_pictures(results.ranks, results.out / "plots", results.exposure),
+        "table": ranks.rank_table(results.ranks),
+    }
 
 
 def temporal_cases(results):

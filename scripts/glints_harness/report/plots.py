@@ -25,12 +25,17 @@ STYLES = {
     "glints_yan16_flat": ("#D55E00", "X", "-"),
     "glints_yan16_curved": ("#E69F00", "s", "-"),
     "glints_direct": ("#009E73", "^", "-"),
+    "glints_tensor": ("#B8860B", "d", "-"),
+    "glints_tensor_prefiltered": ("#00A5A5", ">", "-"),
     "glints_unfiltered": ("#7A5195", "*", "-"),
     "normalmap": ("#CC79A7", "D", "--"),
     "roughconductor": ("#808080", "v", ":"),
     "reference": ("#000000", "", "-"),
+    "isotropic": ("#0072B2", "o", "-"),
+    "brushed": ("#D55E00", "X", "-"),
+    "flakes": ("#009E73", "^", "-"),
 }
-"""Colour, marker, line of each method; dashed and dotted: another reflectance model."""
+"""Colour, marker, line of each method, and of each map in plots over rank; dashed and dotted: another reflectance model."""
 
 SPARE_STYLES = (("#F0E442", "h", "-"), ("#4B0092", "<", "-"))
 

@@ -280,6 +280,34 @@ def sweep_table(results):
     return table(columns, rows, group_by=(0, 1))
 
 
+def prefiltering_table(results):
+    """Errors with and without prefiltered environment light, split into bias and variance."""
+    columns = [
+        Column("method and footprint rule", text=True),
+        Column("samples", text=True),
+        Column("time", "s"),
+        Column("RMSE", "radiance"),
+        Column("bias²", "radiance²"),
+        Column("variance", "radiance²"),
+        Column("relative MSE"),
+        Column("HDR-FLIP"),
+    ]
+    rows = [
+        (
+            method_cell(item),
+            sample_text(item),
+            Cell(number(item.seconds.value), interval(item.seconds)),
+            estimate_cell(item.errors["rmse"].total),
+            estimate_cell(item.errors["rmse"].bias),
+            estimate_cell(item.errors["rmse"].variance),
+            *(estimate_cell(item.errors[name].total) for name in ("relmse", "flip")),
+        )
+        for item in results.prefiltering
+        if item.errors
+    ]
+    return table(columns, rows, group_by=(0,))
+
+
 def temporal_table(results):
     """Excess variance over time of every sequence."""
     columns = [
