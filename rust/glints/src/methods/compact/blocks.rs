@@ -1,6 +1,6 @@
 //! Quantised normals sorted by direction, block by block: for roughnesses so low that few texels of a footprint matter.
 //!
-//! **Layout** The map is cut into blocks of `2^s x 2^s` texels (s = 6, 7 or 8; smaller at the map's far sides). The
+//! **Layout** The map is cut into blocks of `2^s x 2^s` texels (s = 6 to 9; smaller at the map's far sides). The
 //! [`Grid`] of quantised normals is grouped into cells of `2^r x 2^r`; the texels of a block are sorted by cell, row of
 //! cells by row. Of a texel only what its cell does not say is stored, in one word:
 //!
@@ -25,19 +25,35 @@ use rayon::prelude::*;
 use wide::{CmpGe, f32x8, u32x8};
 
 use super::array::Array;
-use super::border::Border;
+use super::border::{Touched, Weight};
 use super::cover::Rect;
 use super::grid::Grid;
 use super::lanes::{LANES, lane_mask};
-use super::lobes::Sums;
+use super::lobes::{Near, Sums};
 use super::packing::{GROUP, Packed, pack, prefetch, to_float, units_per_group};
 use crate::normal_map::NormalMap;
 
 /// One in so many elements of the permutation has a pointer.
 pub const STRIDE: usize = 16;
 
+/// Least and greatest s. A pointer of 16 bits tells `2^(2 s) / STRIDE` elements apart.
+pub const SIDE_BITS: [u32; 2] = [6, 9];
+
 /// Spreads the elements that have pointers, whatever pattern a permutation follows; any odd number would do.
 const SPREAD: u32 = 40_503;
+
+/// Its inverse modulo 2^32, and so modulo any smaller power of two.
+const INV_SPREAD: u32 = inverse(SPREAD);
+
+/// Newton's iteration doubles the number of right bits, of which an odd number is its own inverse for three.
+const fn inverse(odd: u32) -> u32 {
+    let (mut inverse, mut k) = (odd, 0);
+    while k < 4 {
+        inverse = inverse.wrapping_mul(2_u32.wrapping_sub(odd.wrapping_mul(inverse)));
+        k += 1;
+    }
+    inverse
+}
 
 /// Sizes that follow from the map and the roughness.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -194,6 +210,12 @@ impl Geometry {
         let spread = element.wrapping_mul(SPREAD) & ((1 << (2 * self.side_bits)) - 1);
         ((spread as usize) < self.pointers()).then_some(spread as usize)
     }
+
+    /// The element that has a pointer: the inverse of [`Self::pointer`].
+    #[inline]
+    pub fn pointed(&self, pointer: u16) -> u32 {
+        u32::from(pointer).wrapping_mul(INV_SPREAD) & ((1 << (2 * self.side_bits)) - 1)
+    }
 }
 
 impl Block {
@@ -323,7 +345,7 @@ impl Blocks {
             }
             match self.geometry.pointer(element) {
                 Some(pointer) if !shortened => {
-                    element = u32::from(pointers[pointer]);
+                    element = self.geometry.pointed(pointers[pointer]);
                     shortened = true;
                 }
                 _ => element = next,
@@ -343,7 +365,7 @@ impl Blocks {
             element = match self.geometry.pointer(element) {
                 Some(pointer) if !shortened => {
                     shortened = true;
-                    u32::from(pointers[pointer])
+                    self.geometry.pointed(pointers[pointer])
                 }
                 _ => self.words.word(element as usize) & self.place_mask(),
             };
@@ -398,7 +420,7 @@ pub struct Reader<'a> {
     /// The half vector's projection and the reach, in cells.
     center: [f32; 2],
     reach: f32,
-    asked: [Asked; BATCH],
+    asked: [Asked<'a>; BATCH],
     asked_len: usize,
     runs: [Run; RUNS],
     runs_len: usize,
@@ -407,11 +429,11 @@ pub struct Reader<'a> {
 const BATCH: usize = 16;
 const RUNS: usize = 32;
 
-/// A block, and the weight of its texels if all have the same; otherwise each has its area in the footprint.
+/// A block, and what its texels weigh.
 #[derive(Clone, Copy)]
-struct Asked {
+struct Asked<'a> {
     block: Block,
-    weight: Option<f32>,
+    weight: Weight<'a>,
 }
 
 /// Neighbouring cells of one row of cells in a block: their texels lie one behind the other.
@@ -442,7 +464,7 @@ impl<'a> Reader<'a> {
             reach: sums.reach() / cell,
             asked: [Asked {
                 block: blocks.geometry.block(0),
-                weight: None,
+                weight: Weight::alike(0.0),
             }; BATCH],
             asked_len: 0,
             runs: [Run::default(); RUNS],
@@ -450,8 +472,8 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Adds the texels of the block at a corner, all with a weight, or each with its area.
-    pub fn add(&mut self, rect: &Rect, weight: Option<f32>, border: Option<&mut Border>, sums: &mut Sums) {
+    /// Adds the texels of the block at a corner.
+    pub fn add(&mut self, rect: &Rect, weight: Weight<'a>, sums: &mut Sums) {
         let block = self.blocks.geometry.block_at(rect.low.0, rect.low.1);
         let base = self.blocks.cell_base(&block);
         let rows = block.index * (self.blocks.geometry.cell_rows() + 1);
@@ -467,21 +489,21 @@ impl<'a> Reader<'a> {
         self.asked[self.asked_len] = Asked { block, weight };
         self.asked_len += 1;
         if self.asked_len == BATCH {
-            self.flush(border, sums);
+            self.flush(sums);
         }
     }
 
-    /// Adds what waits. To be called before the border changes.
-    pub fn flush(&mut self, mut border: Option<&mut Border>, sums: &mut Sums) {
+    /// Adds what waits.
+    pub fn flush(&mut self, sums: &mut Sums) {
         for index in 0..self.asked_len {
             for row in self.rows() {
                 self.find_run(index, row);
                 if self.runs_len == RUNS {
-                    self.read(border.as_deref_mut(), sums);
+                    self.read(sums);
                 }
             }
         }
-        self.read(border, sums);
+        self.read(sums);
         self.asked_len = 0;
     }
 
@@ -548,39 +570,35 @@ impl<'a> Reader<'a> {
     }
 
     /// Reads all runs.
-    fn read(&mut self, mut border: Option<&mut Border>, sums: &mut Sums) {
-        for run in &self.runs[..self.runs_len] {
-            let Asked { block, weight } = &self.asked[run.asked as usize];
-            match (weight, border.as_deref_mut()) {
-                (&Some(weight), _) => self.blocks.for_each_near(block, run, sums, |sums, near, _| {
-                    sums.add_alike(near.lanes, near.x, near.y, weight);
-                }),
-                (None, Some(border)) => self.blocks.add_cut(block, run, border, sums),
-                (None, None) => {}
+    fn read(&mut self, sums: &mut Sums) {
+        let mut touched = Touched::new();
+        for runs in self.runs[..self.runs_len].chunk_by(|a, b| a.asked == b.asked) {
+            let Asked { block, weight } = &self.asked[runs[0].asked as usize];
+            for run in runs {
+                if weight.cuts.is_empty() {
+                    self.blocks.for_each_near(block, run, sums, |sums, near, _| {
+                        sums.add_alike(near.lanes, near.x, near.y, weight.base);
+                    });
+                } else {
+                    self.blocks.for_each_near(block, run, sums, |sums, near, words| {
+                        touched.add(near, self.blocks.positions(block, words), weight, sums);
+                    });
+                }
             }
+            touched.flush(weight, sums);
         }
         self.runs_len = 0;
     }
 }
 
 impl Blocks {
-    /// Adds the texels of a run, each with its area in the footprint.
-    fn add_cut(&self, block: &Block, run: &Run, border: &mut Border, sums: &mut Sums) {
-        let (left, top) = border.place(block.x, block.y);
-        let (width, inv_width) = (block.width as f32, 1.0 / block.width as f32);
-        let place_mask = u32x8::splat(self.place_mask());
-        self.for_each_near(block, run, sums, |sums, near, words| {
-            let place = to_float(words & place_mask);
-            let row = ((place + 0.5) * inv_width).floor();
-            let column = place - row * width;
-            let (columns, rows) = (column + left, row + top);
-            let (touched, inside) = border.sides(columns, rows);
-            sums.add_alike(near.lanes & inside, near.x, near.y, 1.0);
-            let cut = near.lanes & touched & !inside;
-            if cut != 0 {
-                border.add(cut, [near.x, near.y], [columns, rows], sums);
-            }
-        });
+    /// Columns and rows of texels.
+    #[inline(always)]
+    fn positions(&self, block: &Block, words: u32x8) -> [f32x8; 2] {
+        let places = to_float(words & u32x8::splat(self.place_mask()));
+        let rows = ((places + 0.5) * (1.0 / block.width as f32)).floor();
+        let columns = places - rows * block.width as f32;
+        [columns + block.x as f32, rows + block.y as f32]
     }
 
     /// Calls `visit` with the texels of a run, eight at a time, and their words.
@@ -627,13 +645,6 @@ impl Blocks {
             visit(sums, &Near { lanes, x, y }, words);
         }
     }
-}
-
-/// Cells of normals of which those in `lanes` may be within reach.
-struct Near {
-    lanes: u32,
-    x: f32x8,
-    y: f32x8,
 }
 
 /// Where one block is written.
@@ -718,7 +729,7 @@ fn link(geometry: &Geometry, sorted: &[u32], mask: u32, pointers: &mut [u16]) {
                     Some(previous) => pointers[pointer] = previous,
                     None => first = Some(pointer),
                 }
-                previous = Some(element as u16);
+                previous = Some(pointer as u16);
             }
             element = (sorted[element] & mask) as usize;
             if element == start {

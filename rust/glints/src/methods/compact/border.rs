@@ -1,8 +1,8 @@
 //! Areas of the texels that the border of a footprint cuts.
 //!
-//! Most texels of a footprint lie inside it, with weight one, and of those at its border few are near the half vector. Those
-//! wait here, with their places, until there are eight: then the share of their squares inside the footprint is computed for
-//! all at once.
+//! Of the texels of a square that the border cuts, few are near the half vector. Those wait here ([`Touched`]) until there
+//! are several; then the share of their squares inside the footprint is computed for eight at once. A footprint that wraps around the map has
+//! several borders there, and a texel the sum of its shares ([`Weight`]).
 //!
 //! **Computes** A footprint is `|s| <= 1/2, |t| <= 1/2` of two linear functions. A square that only `|s| = 1/2` cuts has the
 //! share `f(1/2 - s) + f(1/2 + s) - 1` inside, with s at its middle, gradient `(g_x, g_y)`, `a >= b` the greater and the
@@ -19,31 +19,127 @@
 //! **Bounds** Positions count from the footprint's middle, in single precision: weights are within 1e-4 of the exact area.
 
 use glam::DVec2;
-use wide::{CmpGe, CmpGt, CmpLe, f32x8};
+use wide::{CmpGe, CmpGt, CmpLe, CmpLt, f32x8, u32x8};
 
-use super::lanes::{bits, compress, eight};
-use super::lobes::Sums;
+use super::lanes::{LANES, bits, compress, eight};
+use super::lobes::{Near, Sums};
 use crate::footprint::Parallelogram;
 
 /// Thickness in texels below which single precision does not tell the two sides of a footprint apart.
 const THIN: f64 = 0.05;
 
-/// Room for whole groups of eight.
-const QUEUE: usize = 64;
-
-/// The border of one parallelogram, and texels near it that wait.
+/// The border of one parallelogram.
 pub struct Border<'a> {
     pub region: &'a Parallelogram,
     /// The texel that positions count from, and of it the middle less the footprint's.
-    origin: [i32; 2],
+    origin: [f32; 2],
     offset: [f32; 2],
     slabs: [Slab; 2],
     is_thin: bool,
+}
+
+/// What the texels of a square weigh: a number, and the areas inside some of several borders.
+#[derive(Clone, Copy)]
+pub struct Weight<'a> {
+    pub base: f32,
+    pub borders: &'a [Border<'a>],
+    /// Which of the borders count.
+    pub cuts: &'a [u16],
+    /// The border, if one is all there is.
+    only: Option<&'a Border<'a>>,
+}
+
+impl<'a> Weight<'a> {
+    pub fn new(base: f32, borders: &'a [Border<'a>], cuts: &'a [u16]) -> Self {
+        let only = match cuts {
+            &[cut] if base == 0.0 => borders.get(usize::from(cut)),
+            _ => None,
+        };
+        Self {
+            base,
+            borders,
+            cuts,
+            only,
+        }
+    }
+
+    /// The same for all texels.
+    pub fn alike(base: f32) -> Self {
+        Self::new(base, &[], &[])
+    }
+
+    /// The borders that count.
+    pub fn borders(&self) -> impl Iterator<Item = &'a Border<'a>> + use<'a> {
+        let borders = self.borders;
+        self.cuts
+            .iter()
+            .filter_map(move |&cut| borders.get(usize::from(cut)))
+    }
+
+    /// Weights of the texels of `lanes`; those of the others say nothing.
+    #[inline]
+    pub fn of(&self, lanes: u32, columns: f32x8, rows: f32x8) -> f32x8 {
+        let areas = self.borders().map(|border| border.areas(lanes, columns, rows));
+        areas.fold(f32x8::splat(self.base), |sum, area| sum + area)
+    }
+}
+
+/// Texels that may be within reach and that the border may cut. They wait until there are several groups.
+pub struct Touched {
     x: [f32; QUEUE],
     y: [f32; QUEUE],
     columns: [f32; QUEUE],
     rows: [f32; QUEUE],
     len: usize,
+}
+
+/// Room for whole groups of eight.
+const QUEUE: usize = 128;
+
+impl Touched {
+    pub fn new() -> Self {
+        Self {
+            x: [0.0; QUEUE],
+            y: [0.0; QUEUE],
+            columns: [0.0; QUEUE],
+            rows: [0.0; QUEUE],
+            len: 0,
+        }
+    }
+
+    /// Adds texels at `columns` and `rows`, that weigh what `weight` says. Most lie inside the only border, or outside: those
+    /// need not wait.
+    #[inline(always)]
+    pub fn add(&mut self, near: &Near, [columns, rows]: [f32x8; 2], weight: &Weight, sums: &mut Sums) {
+        let mut lanes = near.lanes;
+        if let Some(border) = weight.only {
+            let (touched, inside) = border.sides(columns, rows);
+            sums.add_alike(lanes & inside, near.x, near.y, 1.0);
+            lanes &= touched & !inside;
+        }
+        if lanes == 0 {
+            return;
+        }
+        compress(lanes, near.x, &mut self.x, self.len);
+        compress(lanes, near.y, &mut self.y, self.len);
+        compress(lanes, columns, &mut self.columns, self.len);
+        compress(lanes, rows, &mut self.rows, self.len);
+        self.len += lanes.count_ones() as usize;
+        if self.len > QUEUE - 8 {
+            self.flush(weight, sums);
+        }
+    }
+
+    /// Adds what waits. To be called before the weight changes.
+    #[inline(never)]
+    pub fn flush(&mut self, weight: &Weight, sums: &mut Sums) {
+        for start in (0..self.len).step_by(8) {
+            let lanes = (1 << (self.len - start).min(8)) - 1;
+            let weights = weight.of(lanes, eight(&self.columns, start), eight(&self.rows, start));
+            sums.add(lanes, eight(&self.x, start), eight(&self.y, start), weights);
+        }
+        self.len = 0;
+    }
 }
 
 /// One of the two linear functions, per texel.
@@ -55,6 +151,9 @@ struct Slab {
     short: f32,
     inv_long: f32,
     inv_product: f32,
+    /// In a row at y, texels touch the slab within `half_width` of `x = shift y`.
+    shift: f32,
+    half_width: f32,
 }
 
 impl Slab {
@@ -65,7 +164,15 @@ impl Slab {
         } else {
             0.0
         };
+        // Along the rows, a slab holds all of a row or nothing.
+        let gx = if gradient.x.abs() > 1e-9 * long {
+            gradient.x
+        } else {
+            1e-9 * long
+        };
         Self {
+            shift: (-gradient.y / gx) as f32,
+            half_width: ((0.5 + 0.5 * (long + short)) / gx.abs()) as f32,
             gradient: gradient.as_vec2().to_array(),
             long: long as f32,
             short: short as f32,
@@ -113,29 +220,26 @@ impl<'a> Border<'a> {
         let thickness = slabs.map(|gradient| 1.0 / gradient.length());
         Self {
             region,
-            origin: [origin.x as i32, origin.y as i32],
+            origin: origin.as_vec2().to_array(),
             offset: (origin + 0.5 - center).as_vec2().to_array(),
             slabs: slabs.map(Slab::new),
             is_thin: thickness[0].min(thickness[1]) < THIN,
-            x: [0.0; QUEUE],
-            y: [0.0; QUEUE],
-            columns: [0.0; QUEUE],
-            rows: [0.0; QUEUE],
-            len: 0,
         }
     }
 
-    /// Position of a texel relative to the footprint's origin.
+    /// Positions of the middles of texels from the footprint's; columns and rows are whole, and their difference exact.
     #[inline(always)]
-    pub fn place(&self, column: u32, row: u32) -> (f32, f32) {
-        let [x, y] = self.origin;
-        ((column as i32 - x) as f32, (row as i32 - y) as f32)
+    fn from_middle(&self, columns: f32x8, rows: f32x8) -> (f32x8, f32x8) {
+        (
+            columns - self.origin[0] + self.offset[0],
+            rows - self.origin[1] + self.offset[1],
+        )
     }
 
-    /// Which of eight texels at `(columns, rows)`, as from [`Self::place`], are not outside, and which are inside.
+    /// Which of eight texels are not outside, and which are inside.
     #[inline(always)]
-    pub fn sides(&self, columns: f32x8, rows: f32x8) -> (u32, u32) {
-        let (x, y) = (columns + self.offset[0], rows + self.offset[1]);
+    fn sides(&self, columns: f32x8, rows: f32x8) -> (u32, u32) {
+        let (x, y) = self.from_middle(columns, rows);
         let (mut outside, mut inside) = (f32x8::ZERO, f32x8::ONE.cmp_gt(f32x8::ZERO));
         for slab in &self.slabs {
             let s = slab.distance(x, y);
@@ -146,53 +250,57 @@ impl<'a> Border<'a> {
         (!outside.move_mask() as u32 & 0xff, inside.move_mask() as u32)
     }
 
-    /// Adds cut texels in `lanes`, whose normals project to `(x, y)`.
-    #[inline(always)]
-    pub fn add(&mut self, lanes: u32, [x, y]: [f32x8; 2], [columns, rows]: [f32x8; 2], sums: &mut Sums) {
-        compress(lanes, x, &mut self.x, self.len);
-        compress(lanes, y, &mut self.y, self.len);
-        compress(lanes, columns, &mut self.columns, self.len);
-        compress(lanes, rows, &mut self.rows, self.len);
-        self.len += lanes.count_ones() as usize;
-        if self.len > QUEUE - 8 {
-            self.flush(sums);
-        }
-    }
-
-    /// Adds what waits. To be called before the border is left.
-    #[cold]
-    pub fn flush(&mut self, sums: &mut Sums) {
-        for start in (0..self.len).step_by(8) {
-            let lanes = (1_u32 << (self.len - start).min(8)) - 1;
-            let weights = self.weights(lanes, eight(&self.columns, start), eight(&self.rows, start));
-            sums.add(lanes, eight(&self.x, start), eight(&self.y, start), weights);
-        }
-        self.len = 0;
-    }
-
-    /// Areas of texels inside the footprint.
-    fn weights(&self, lanes: u32, columns: f32x8, rows: f32x8) -> f32x8 {
-        let (x, y) = (columns + self.offset[0], rows + self.offset[1]);
+    /// Areas of texels inside the footprint, of those in `lanes`.
+    #[inline]
+    fn areas(&self, lanes: u32, columns: f32x8, rows: f32x8) -> f32x8 {
+        let (x, y) = self.from_middle(columns, rows);
         let [s, t] = self.slabs.each_ref().map(|slab| {
             let distance = slab.distance(x, y);
             let is_cut = distance.cmp_gt(f32x8::splat(0.5 - slab.variation()));
-            (slab.share(distance), is_cut)
+            let touches = distance.cmp_lt(f32x8::splat(0.5 + slab.variation()));
+            (slab.share(distance), is_cut, touches)
         });
-        let mut weights = s.1.blend(s.0, f32x8::ONE) * t.1.blend(t.0, f32x8::ONE);
+        let mut areas = s.1.blend(s.0, f32x8::ONE) * t.1.blend(t.0, f32x8::ONE);
+        let touched = s.2 & t.2;
         let exact = if self.is_thin {
-            lanes
+            touched
         } else {
-            lanes & (s.1 & t.1).move_mask() as u32
+            touched & s.1 & t.1
         };
-        for k in bits(exact) {
-            let (column, row) = (columns.as_array_ref()[k] as i32, rows.as_array_ref()[k] as i32);
+        for k in bits(lanes & exact.move_mask() as u32) {
             let corner = DVec2::new(
-                f64::from(column + self.origin[0]),
-                f64::from(row + self.origin[1]),
+                f64::from(columns.as_array_ref()[k]),
+                f64::from(rows.as_array_ref()[k]),
             );
-            weights.as_array_mut()[k] = self.region.overlap(corner, corner + 1.0) as f32;
+            areas.as_array_mut()[k] = self.region.overlap(corner, corner + 1.0) as f32;
         }
-        weights.fast_max(f32x8::ZERO)
+        areas.fast_max(f32x8::ZERO) & touched
+    }
+
+    /// Bit `8 y + x`: the footprint may touch this one of the 8 x 8 texels from `(column, row)` on. It touches no other.
+    #[inline]
+    pub fn touched(&self, column: u32, row: u32) -> u64 {
+        let (x, y) = self.from_middle(f32x8::splat(column as f32), LANES + row as f32);
+        let (mut first, mut last) = (f32x8::splat(-1.0), f32x8::splat(8.0));
+        for slab in &self.slabs {
+            let middle = y * slab.shift - x;
+            let half = f32x8::splat(slab.half_width);
+            // Rounding grows with the numbers that are subtracted.
+            let reach = half + (0.01 + (middle.abs() + half) * 4e-6);
+            first = first.fast_max(middle - reach);
+            last = last.fast_min(middle + reach);
+        }
+        let count = |x: f32x8| -> u32x8 {
+            let clamped = x.fast_max(f32x8::ZERO).fast_min(f32x8::splat(8.0));
+            bytemuck::cast(clamped.trunc_int())
+        };
+        // Texels from the first on, and up to the last.
+        let from = u32x8::splat(0xff) << count(first.ceil());
+        let to = u32x8::splat(0xff) >> (u32x8::splat(8) - count(last.floor() + 1.0));
+        let rows = (from & to).to_array();
+        rows.into_iter()
+            .rev()
+            .fold(0, |mask, row| mask << 8 | u64::from(row & 0xff))
     }
 }
 
@@ -217,18 +325,16 @@ mod tests {
             let footprint = Footprint::in_texels(40, 40, center.into(), a, b);
             let region = footprint.region().unwrap();
             let border = Border::new(region);
-            let (column, row) = border.place(first.0, first.1);
-            let (columns, rows) = (LANES + column, f32x8::splat(row));
-            let (touched, inside) = border.sides(columns, rows);
-            let weights = border.weights(0xff, columns, rows).to_array();
-            for (k, &weight) in weights.iter().enumerate() {
+            let touched = border.touched(first.0, first.1);
+            let (columns, rows) = (LANES + first.0 as f32, f32x8::splat(first.1 as f32));
+            let areas = border.areas(0xff, columns, rows).to_array();
+            for (k, &found) in areas.iter().enumerate() {
                 let area = region.texel_overlap(first.0 + k as u32, first.1) as f32;
-                let expected = match (touched >> k & 1, inside >> k & 1) {
-                    (0, _) => 0.0,
-                    (_, 1) => 1.0,
-                    _ => weight,
-                };
-                prop_assert!((expected - area).abs() < 1e-4, "{expected} for {area} in lane {k}");
+                prop_assert!((found - area).abs() < 1e-4, "{found} for {area} in lane {k}");
+            }
+            for k in 0..64 {
+                let area = region.texel_overlap(first.0 + k % 8, first.1 + k / 8);
+                prop_assert!(area < 1e-6 || touched >> k & 1 == 1, "texel {k} of area {area}");
             }
         }
     }

@@ -5,7 +5,7 @@
 
 use rayon::prelude::*;
 
-use super::blocks::{Block, Blocks, Geometry};
+use super::blocks::{Block, Blocks, Geometry, SIDE_BITS};
 use super::counts;
 use super::grid::Grid;
 use super::packing::WIDTHS;
@@ -58,7 +58,7 @@ pub fn geometry(geometry: &Geometry) -> Checked<()> {
     let Geometry {
         side_bits, cell_bits, ..
     } = *geometry;
-    let sizes = (6..=8).contains(&side_bits) && (1..=10).contains(&cell_bits);
+    let sizes = (SIDE_BITS[0]..=SIDE_BITS[1]).contains(&side_bits) && (1..=10).contains(&cell_bits);
     demand(sizes && WIDTHS.contains(&geometry.bits()), || {
         format!("blocks of 2^{side_bits} texels and cells of 2^{cell_bits}")
     })?;
@@ -117,7 +117,10 @@ fn permutation(blocks: &Blocks, block: &Block) -> Checked<()> {
     let places = texels == blocks.geometry().places() || (0..texels as u32).all(|e| place(e) < texels);
     let pointers = blocks.pointers_of(block).iter();
     demand(
-        places && pointers.copied().all(|to| usize::from(to) < texels),
+        places
+            && pointers
+                .copied()
+                .all(|to| (blocks.geometry().pointed(to) as usize) < texels),
         || "a texel lies outside its block".into(),
     )
 }

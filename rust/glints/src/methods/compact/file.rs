@@ -1,6 +1,6 @@
 //! Saving and loading: a structure is built once, and used in place by every later run.
 //!
-//! **Format**, version 2. Numbers are little-endian. The fixed fields:
+//! **Format**, version 3. Numbers are little-endian. The fixed fields:
 //!
 //! | offset | type | |
 //! |---|---|---|
@@ -63,7 +63,7 @@ use crate::flakes::{FlakeModel, Normalization};
 use crate::microfacet::{Distribution, Flake};
 
 /// The version that is written, and the only one that is read.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 
 const MAGIC: [u8; 8] = *b"\x89GLINTS\n";
 const BYTE_ORDER: u32 = 0x0a0b_0c0d;

@@ -123,6 +123,13 @@ pub struct Query {
     unshadowed: f32,
 }
 
+/// Cells of normals, of which those in `lanes` may be within reach.
+pub struct Near {
+    pub lanes: u32,
+    pub x: f32x8,
+    pub y: f32x8,
+}
+
 /// Value, which is the distribution of normals or, with directions, the reflection; and density; see
 /// [`crate::methods::Method`].
 #[derive(Clone, Copy)]
@@ -287,9 +294,10 @@ impl Sums {
         flat.cmp_lt(f32x8::splat(self.radius2)).move_mask() as u32
     }
 
-    /// Adds the lobes of the normals in cells `(x, y)` of `lanes`, with their weights.
+    /// Adds the lobes of the normals in cells `(x, y)` of `lanes` that weigh more than nothing, with their weights.
     #[inline(always)]
     pub fn add(&mut self, lanes: u32, x: f32x8, y: f32x8, weights: f32x8) {
+        let lanes = lanes & weights.cmp_gt(f32x8::ZERO).move_mask() as u32;
         compress(lanes, x, &mut self.x, self.len);
         compress(lanes, y, &mut self.y, self.len);
         compress(lanes, weights, &mut self.weights, self.len);

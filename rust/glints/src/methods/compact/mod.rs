@@ -71,11 +71,12 @@ use crate::half_vector::DirectionPair;
 use crate::hash::mix;
 use crate::normal_map::NormalMap;
 use blocks::{Blocks, Geometry, Reader};
-use border::Border;
+use border::{Border, Weight};
 use counts::{CountSum, Counts};
 use cover::{Node, Rect, Scale, Treatment, Tree};
 use grid::Grid;
 use lobes::{Lobe, Query, Sums};
+use packing::WIDTHS;
 use tiles::Tiles;
 
 pub use file::{Header, VERSION, is_saved, read_header};
@@ -84,7 +85,7 @@ pub use file::{Header, VERSION, is_saved, read_header};
 pub const ROUGH: f64 = 0.02;
 
 /// Most texels of a block within reach of a typical half vector.
-const NEAR_TEXELS: f64 = 200.0;
+const NEAR_TEXELS: f64 = 250.0;
 
 /// What the whole structure may take, 18 MB for 2048 x 2048 texels.
 pub const BYTES_PER_TEXEL: f64 = 18e6 / (2048.0 * 2048.0);
@@ -92,8 +93,8 @@ pub const BYTES_PER_TEXEL: f64 = 18e6 / (2048.0 * 2048.0);
 /// Quantisation of normals in standard deviations of a lobe.
 const QUANTUM: f64 = 0.055;
 
-/// Texels of a block for each cell of the directory: more make the directory smaller, fewer the cells.
-const TEXELS_PER_CELL: f64 = 12.0;
+/// Least number of texels of a block for each cell of the directory: fewer make the cells smaller, and the directory larger.
+const TEXELS_PER_CELL: f64 = 6.0;
 
 /// A footprint that touches fewer texels is summed over them where they are kept in the map's order.
 const DIRECT: f64 = 6500.0;
@@ -270,11 +271,7 @@ impl CompactBinMap {
             return;
         };
         footprint.for_each_part(|part| match part {
-            Part::Cut(region) => {
-                let mut border = Border::new(&region);
-                tiles.add(&mut border, &everything, sums);
-                border.flush(sums);
-            }
+            Part::Cut(region) => tiles.add(&Border::new(&region), &everything, sums),
             // Only a map of fewer texels than a small footprint lies inside one entirely.
             Part::Whole(count) => tiles.add_all(&everything, count as f32, sums),
             Part::Texel { .. } => {}
@@ -283,53 +280,68 @@ impl CompactBinMap {
 
     /// Adds what covers a large footprint.
     fn add_cover(&self, footprint: &Footprint, sums: &mut Sums) {
-        let mut covered = Covered::new(self, sums);
         let scale = self.scale(footprint);
         if self.is_everywhere(scale) {
             let even = footprint.area() / (f64::from(self.map.0) * f64::from(self.map.1));
-            self.tree.cover(
-                &cover::Part::new(None, scale),
-                &self.is_unit(),
-                &mut |node, treatment| {
-                    covered.add(node, treatment.scaled(even), None);
-                },
-            );
-        } else if let Some(region) = footprint.single_part() {
-            let mut border = Border::new(region);
-            self.tree.cover(
-                &cover::Part::new(Some(region), scale),
-                &self.is_unit(),
-                &mut |node, treatment| {
-                    covered.add(node, treatment, Some(&mut border));
-                },
-            );
-            covered.end_part(Some(&mut border));
-        } else {
-            // The same node may be covered in several periods: it is looked at once.
-            let mut nodes = Vec::new();
-            footprint.for_each_part(|part| {
-                let (region, count) = match &part {
-                    Part::Cut(region) => (Some(region), 1.0),
-                    Part::Whole(count) => (None, *count as f64),
-                    Part::Texel { .. } => return,
-                };
-                let part = cover::Part::new(region, scale);
-                let mut border = region.map(Border::new);
-                self.tree.cover(
-                    &part,
-                    &self.is_unit(),
-                    &mut |node, treatment| match treatment.scaled(count) {
-                        Treatment::Whole(weight) => nodes.push((*node, weight)),
-                        other => covered.add(node, other, border.as_mut()),
-                    },
-                );
-                covered.end_part(border.as_mut());
+            let mut covered = Covered::new(self, &[], sums);
+            self.cover(None, scale, |node, treatment| {
+                covered.add(node, treatment.scaled(even), &[]);
             });
-            nodes.sort_unstable_by_key(|&(node, _)| node);
-            for same in nodes.chunk_by(|a, b| a.0 == b.0) {
-                let weight = same.iter().map(|&(_, weight)| weight).sum();
-                covered.add(&same[0].0, Treatment::Whole(weight), None);
-            }
+            covered.finish();
+        } else if let Some(region) = footprint.single_part() {
+            let border = Border::new(region);
+            let mut covered = Covered::new(self, std::slice::from_ref(&border), sums);
+            self.cover(Some(region), scale, |node, treatment| {
+                covered.add(node, treatment, &[0])
+            });
+            covered.finish();
+        } else {
+            self.add_parts(footprint, scale, sums);
+        }
+    }
+
+    fn cover(&self, region: Option<&Parallelogram>, scale: Scale, mut visit: impl FnMut(&Node, Treatment)) {
+        self.tree
+            .cover(&cover::Part::new(region, scale), &self.is_unit(), &mut visit);
+    }
+
+    /// Adds what covers a footprint in several periods of the map. The same node may be covered in some of them: it is looked
+    /// at once.
+    fn add_parts(&self, footprint: &Footprint, scale: Scale, sums: &mut Sums) {
+        let (mut regions, mut periods) = (Vec::new(), 0.0);
+        footprint.for_each_part(|part| match part {
+            Part::Cut(region) => regions.push(region),
+            Part::Whole(count) => periods = count as f64,
+            Part::Texel { .. } => {}
+        });
+        // Nodes, each with its weight or with the number of the border that cuts it.
+        let mut nodes: Vec<(u64, Node, f64)> = Vec::new();
+        let mut collect = |node: &Node, treatment, cut: u64| match treatment {
+            Treatment::Whole(weight) => nodes.push((node.key() << 16, *node, weight)),
+            Treatment::Texels => nodes.push((node.key() << 16 | cut, *node, 0.0)),
+            Treatment::Nothing | Treatment::Descend => {}
+        };
+        for (region, cut) in regions.iter().zip(1..) {
+            self.cover(Some(region), scale, |node, treatment| {
+                collect(node, treatment, cut);
+            });
+        }
+        if periods > 0.0 {
+            self.cover(None, scale, |node, treatment| {
+                collect(node, treatment.scaled(periods), 0);
+            });
+        }
+        nodes.sort_unstable_by_key(|&(key, ..)| key);
+        let cut = |&(key, ..): &(u64, Node, f64)| (key as u16).checked_sub(1);
+        let cuts: Vec<u16> = nodes.iter().filter_map(cut).collect();
+        let borders: Vec<Border> = regions.iter().map(Border::new).collect();
+        let mut covered = Covered::new(self, &borders, sums);
+        let mut rest = cuts.as_slice();
+        for same in nodes.chunk_by(|a, b| a.0 >> 16 == b.0 >> 16) {
+            let weight = same.iter().map(|&(.., weight)| weight).sum();
+            let cuts;
+            (cuts, rest) = rest.split_at(same.iter().filter_map(cut).count());
+            covered.add_node(&same[0].1, weight, cuts);
         }
         covered.finish();
     }
@@ -338,6 +350,8 @@ impl CompactBinMap {
 /// What covers a footprint: counts and blocks wait until there are several to read.
 struct Covered<'a> {
     map: &'a CompactBinMap,
+    /// Of the footprint, in all periods of the map.
+    borders: &'a [Border<'a>],
     /// Small footprints have none.
     counts: Option<CountSum<'a>>,
     blocks: Option<Reader<'a>>,
@@ -345,9 +359,10 @@ struct Covered<'a> {
 }
 
 impl<'a> Covered<'a> {
-    fn new(map: &'a CompactBinMap, sums: &'a mut Sums) -> Self {
+    fn new(map: &'a CompactBinMap, borders: &'a [Border<'a>], sums: &'a mut Sums) -> Self {
         Self {
             map,
+            borders,
             counts: None,
             blocks: match &map.texels {
                 Texels::Blocks(blocks) => Some(Reader::new(blocks, sums)),
@@ -357,39 +372,47 @@ impl<'a> Covered<'a> {
         }
     }
 
-    fn add(&mut self, node: &Node, treatment: Treatment, border: Option<&mut Border>) {
-        let weight = match treatment {
-            Treatment::Whole(weight) => Some(weight as f32),
-            Treatment::Texels => None,
-            Treatment::Nothing | Treatment::Descend => return,
-        };
+    fn add(&mut self, node: &Node, treatment: Treatment, cuts: &'a [u16]) {
+        match treatment {
+            Treatment::Whole(weight) => self.add_node(node, weight, &[]),
+            Treatment::Texels => self.add_node(node, 0.0, cuts),
+            Treatment::Nothing | Treatment::Descend => {}
+        }
+    }
+
+    /// Adds the texels of a node, with a weight, and of each the area inside the borders `cuts`.
+    fn add_node(&mut self, node: &Node, weight: f64, cuts: &'a [u16]) {
+        let mut base = weight as f32;
+        if base > 0.0 && self.map.counts.has(node.level) {
+            let new = || CountSum::new(&self.map.counts, self.sums.query.half, self.sums.reach());
+            self.counts
+                .get_or_insert_with(new)
+                .add(&self.map.tree, node, base);
+            base = 0.0;
+        }
+        if base == 0.0 && cuts.is_empty() {
+            return;
+        }
         let rect = self.map.tree.rect(node);
-        match (&self.map.texels, &mut self.blocks, weight, border) {
-            (_, _, Some(weight), _) if self.map.counts.has(node.level) => {
-                let new = || CountSum::new(&self.map.counts, self.sums.query.half, self.sums.reach());
-                self.counts
-                    .get_or_insert_with(new)
-                    .add(&self.map.tree, node, weight);
+        let weight = Weight::new(base, self.borders, cuts);
+        match (&self.map.texels, &mut self.blocks) {
+            (_, Some(blocks)) => blocks.add(&rect, weight, self.sums),
+            (Texels::Tiles(tiles), _) => {
+                if base > 0.0 {
+                    tiles.add_all(&rect, base, self.sums);
+                }
+                for border in weight.borders() {
+                    tiles.add(border, &rect, self.sums);
+                }
             }
-            (_, Some(blocks), weight, border) => blocks.add(&rect, weight, border, self.sums),
-            (Texels::Tiles(tiles), _, Some(weight), _) => tiles.add_all(&rect, weight, self.sums),
-            (Texels::Tiles(tiles), _, None, Some(border)) => tiles.add(border, &rect, self.sums),
             _ => {}
         }
     }
 
-    /// Adds what waits for the border.
-    fn end_part(&mut self, mut border: Option<&mut Border>) {
-        if let Some(blocks) = &mut self.blocks {
-            blocks.flush(border.as_deref_mut(), self.sums);
+    fn finish(self) {
+        if let Some(mut blocks) = self.blocks {
+            blocks.flush(self.sums);
         }
-        if let Some(border) = border {
-            border.flush(self.sums);
-        }
-    }
-
-    fn finish(mut self) {
-        self.end_part(None);
         if let Some(mut counts) = self.counts {
             counts.finish(&self.map.lobe, self.sums);
         }
@@ -497,34 +520,36 @@ fn deviation(alpha: f32) -> f64 {
 
 /// Sizes of blocks, cells and words: the narrowest words whose cells are not too many; with the widest, coarser normals.
 fn block_geometry(map: (u32, u32), alpha: f32, share: f64, bounds: (Vec2, Vec2)) -> Geometry {
-    let side_bits = (6..=8)
+    let [least, most] = blocks::SIDE_BITS;
+    let side_bits = (least..=most)
         .rev()
         .find(|bits| share * f64::from(1_u32 << (2 * bits)) < NEAR_TEXELS)
-        .unwrap_or(6);
+        .unwrap_or(least);
     let pitch = QUANTUM * deviation(alpha);
     let extent = (bounds.1 - bounds.0).as_dvec2().max(glam::DVec2::splat(pitch));
     // A box as large as the hemisphere's holds the disk only.
     let filled = if extent.min_element() > 1.0 { 0.8 } else { 1.0 };
-    let most = f64::from(1_u32 << (2 * side_bits)) / TEXELS_PER_CELL;
+    let most = |bits: u32| {
+        let left = BYTES_PER_TEXEL - f64::from(bits) / 8.0 - 2.0 / blocks::STRIDE as f64;
+        f64::from(1_u32 << (2 * side_bits)) * (left / 2.0).clamp(1.0 / 16.0, 1.0 / TEXELS_PER_CELL)
+    };
     let cells = |pitch: f64, cell_bits: u32| {
         let cell = pitch * f64::from(1_u32 << cell_bits);
         filled * (extent.x / cell).ceil() * (extent.y / cell).ceil()
     };
-    let fitting = [24, 28, 32]
+    let fitting = WIDTHS
         .into_iter()
-        .map(|bits| bits / 2 - side_bits)
-        .find(|&cell_bits| cells(pitch, cell_bits) <= most);
-    let (cell_bits, pitch) = match fitting {
-        Some(cell_bits) => {
-            // Cells as small as the directory allows, for the same words.
-            let finer = (cells(pitch, cell_bits) / most).sqrt();
-            (cell_bits, pitch * finer.clamp(0.2, 1.0))
-        }
-        None => {
-            let cell_bits = 16 - side_bits;
-            (cell_bits, pitch * (cells(pitch, cell_bits) / most).sqrt())
-        }
-    };
+        .filter_map(|bits| Some((bits, (bits / 2).checked_sub(side_bits).filter(|&r| r > 0)?)))
+        .find(|&(bits, cell_bits)| cells(pitch, cell_bits) <= most(bits));
+    let (bits, cell_bits) = fitting.unwrap_or((32, 16 - side_bits));
+    // Cells as small as the directory allows, for the same words; or as large as it must have them.
+    let finer = (cells(pitch, cell_bits) / most(bits)).sqrt();
+    let pitch = pitch
+        * if fitting.is_some() {
+            finer.clamp(0.2, 1.0)
+        } else {
+            finer
+        };
     Geometry {
         map,
         side_bits,

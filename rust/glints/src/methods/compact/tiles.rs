@@ -15,11 +15,11 @@ use rayon::prelude::*;
 use wide::{f32x8, u8x16, u32x8};
 
 use super::array::Array;
-use super::border::Border;
+use super::border::{Border, Touched, Weight};
 use super::cover::Rect;
 use super::grid::Grid;
 use super::lanes::LANES;
-use super::lobes::Sums;
+use super::lobes::{Near, Sums};
 use super::packing::{prefetch, to_float, widened};
 use crate::normal_map::NormalMap;
 
@@ -105,11 +105,13 @@ impl Window {
     }
 }
 
-/// A tile to be read, and whether all of it lies inside the footprint.
+/// A tile to be read.
 #[derive(Clone, Copy, Default)]
 struct Asked {
     column: u32,
     row: u32,
+    /// Bit `8 y + x`: the border may touch the texel, or it lies inside.
+    texels: u64,
     inside: bool,
 }
 
@@ -117,6 +119,15 @@ struct Asked {
 struct Batch {
     asked: [Asked; BATCH],
     len: usize,
+}
+
+impl Batch {
+    fn new() -> Self {
+        Self {
+            asked: [Asked::default(); BATCH],
+            len: 0,
+        }
+    }
 }
 
 impl Tiles {
@@ -185,30 +196,34 @@ impl Tiles {
 
     /// Adds the texels of a footprint inside `rect`, each with its area. A rectangle begins and ends with a tile, or with the
     /// map.
-    pub fn add(&self, border: &mut Border, rect: &Rect, sums: &mut Sums) {
+    pub fn add(&self, border: &Border, rect: &Rect, sums: &mut Sums) {
         let Some(window) = Window::new(sums, &self.grid, self.lower_bits) else {
             return;
         };
-        let mut batch = Batch {
-            asked: [Asked::default(); BATCH],
-            len: 0,
-        };
+        let weight = Weight::new(0.0, std::slice::from_ref(border), &[0]);
+        let mut batch = Batch::new();
         let (columns, rows) = tiles_of(rect);
         let rows = rows.start.into()..rows.end.into();
         for span in border.region.spans_of_rows(DVec2::splat(SIDE.into()), rows) {
             let clamp = |column: i64| column.clamp(columns.start.into(), columns.end.into()) as u32;
             for column in clamp(span.touched.0)..clamp(span.touched.1) {
-                let inside = (span.inside.0..span.inside.1).contains(&i64::from(column));
                 let row = span.row as u32;
-                prefetch(self.tile(column, row), 0..units(self.lower_bits));
-                batch.asked[batch.len] = Asked { column, row, inside };
-                batch.len += 1;
-                if batch.len == BATCH {
-                    self.read(&mut batch, &window, border, sums);
-                }
+                let inside = (span.inside.0..span.inside.1).contains(&i64::from(column));
+                let texels = if inside {
+                    u64::MAX
+                } else {
+                    border.touched(column * SIDE, row * SIDE)
+                };
+                let tile = Asked {
+                    column,
+                    row,
+                    texels,
+                    inside,
+                };
+                self.ask(tile, &mut batch, &window, &weight, sums);
             }
         }
-        self.read(&mut batch, &window, border, sums);
+        self.read(&mut batch, &window, &weight, sums);
     }
 
     /// Adds all texels of `rect`, which begins and ends with a tile, or with the map, each with the weight `weight`.
@@ -216,44 +231,61 @@ impl Tiles {
         let Some(window) = Window::new(sums, &self.grid, self.lower_bits) else {
             return;
         };
+        let weight = Weight::alike(weight);
+        let mut batch = Batch::new();
         let (columns, rows) = tiles_of(rect);
         for (row, column) in rows.flat_map(|row| columns.clone().map(move |column| (row, column))) {
-            self.for_each_found((column, row), &window, sums, |sums, near, _| {
-                sums.add_alike(near.lanes, near.x, near.y, weight);
-            });
+            let tile = Asked {
+                column,
+                row,
+                texels: u64::MAX,
+                inside: true,
+            };
+            self.ask(tile, &mut batch, &window, &weight, sums);
+        }
+        self.read(&mut batch, &window, &weight, sums);
+    }
+
+    #[inline(always)]
+    fn ask(&self, tile: Asked, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
+        prefetch(self.tile(tile.column, tile.row), 0..units(self.lower_bits));
+        batch.asked[batch.len] = tile;
+        batch.len += 1;
+        if batch.len == BATCH {
+            self.read(batch, window, weight, sums);
         }
     }
 
-    fn read(&self, batch: &mut Batch, window: &Window, border: &mut Border, sums: &mut Sums) {
-        for &Asked { column, row, inside } in &batch.asked[..batch.len] {
-            if inside {
-                self.for_each_found((column, row), window, sums, |sums, near, _| {
-                    sums.add_alike(near.lanes, near.x, near.y, 1.0);
+    /// Adds the texels of the tiles that wait.
+    #[inline(never)]
+    fn read(&self, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
+        let mut touched = Touched::new();
+        let alike = if weight.cuts.is_empty() { weight.base } else { 1.0 };
+        for asked in &batch.asked[..batch.len] {
+            let (column, row) = (asked.column, asked.row);
+            let texels = asked.texels & self.within(column, row);
+            if asked.inside {
+                self.for_each_found((column, row), texels, window, sums, |sums, near, _| {
+                    sums.add_alike(near.lanes, near.x, near.y, alike);
                 });
-                continue;
+            } else {
+                let columns = LANES + (column * SIDE) as f32;
+                self.for_each_found((column, row), texels, window, sums, |sums, near, k| {
+                    let rows = f32x8::splat((row * SIDE + k) as f32);
+                    touched.add(near, [columns, rows], weight, sums);
+                });
             }
-            let (left, top) = border.place(column * SIDE, row * SIDE);
-            let columns = LANES + left;
-            self.for_each_found((column, row), window, sums, |sums, near, row| {
-                let rows = f32x8::splat(top + row as f32);
-                let (touched, inside) = border.sides(columns, rows);
-                sums.add_alike(near.lanes & inside, near.x, near.y, 1.0);
-                border.add(
-                    near.lanes & touched & !inside,
-                    [near.x, near.y],
-                    [columns, rows],
-                    sums,
-                );
-            });
         }
+        touched.flush(weight, sums);
         batch.len = 0;
     }
 
-    /// Calls `visit` with the rows of a tile that have texels within reach.
+    /// Calls `visit` with the rows of a tile that have texels within reach, of `texels`.
     #[inline(always)]
     fn for_each_found(
         &self,
         (column, row): (u32, u32),
+        texels: u64,
         window: &Window,
         sums: &mut Sums,
         mut visit: impl FnMut(&mut Sums, &Near, u32),
@@ -262,7 +294,7 @@ impl Tiles {
         let upper: &[u8; 4 * UPPER] = bytemuck::cast_slice(&tile[..UPPER])
             .try_into()
             .expect("the upper bytes");
-        let mut found = window.find(upper) & self.within(column, row);
+        let mut found = window.find(upper) & texels;
         while found != 0 {
             let row = found.trailing_zeros() / SIDE;
             let lanes = (found >> (SIDE * row)) as u32 & 0xff;
@@ -317,13 +349,6 @@ impl Tiles {
         let units = units(self.lower_bits);
         &self.units[index * units..][..units]
     }
-}
-
-/// Cells of normals of which those in `lanes` may be within reach.
-struct Near {
-    lanes: u32,
-    x: f32x8,
-    y: f32x8,
 }
 
 /// 32-bit units of a tile.

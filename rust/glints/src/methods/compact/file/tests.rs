@@ -162,7 +162,7 @@ fn refusals_say_why() {
     let mut damaged = bytes.clone();
     *damaged.last_mut().unwrap() ^= 1;
     for (message, word) in [
-        (refusal_of(&newer), "version 2"),
+        (refusal_of(&newer), format!("version {VERSION}").as_str()),
         (refusal_of(&damaged), "checksum"),
         (refusal_of(&bytes[..bytes.len() - 1]), "bytes instead of"),
         (refusal_of(&bytes[..60]), "bytes instead of"),
