@@ -9,8 +9,8 @@ use glints::footprint::Footprint;
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::{Value, json};
 
-/// Texels of the largest footprint that the direct sum is asked over, milliseconds a query.
-pub const LARGEST_DIRECT: f64 = 1024.0 * 1024.0;
+/// Texels of the largest footprint that the direct sum is asked over, some ten milliseconds a query.
+pub const LARGEST_DIRECT: f64 = 2048.0 * 2048.0;
 
 /// Length and thickness of a footprint in texels.
 #[derive(Clone, Copy)]

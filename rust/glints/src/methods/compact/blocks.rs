@@ -424,10 +424,14 @@ pub struct Reader<'a> {
     asked_len: usize,
     runs: [Run; RUNS],
     runs_len: usize,
+    touched: Touched,
 }
 
 const BATCH: usize = 16;
 const RUNS: usize = 32;
+
+/// Most cells of a run.
+const RUN_CELLS: usize = 16;
 
 /// A block, and what its texels weigh.
 #[derive(Clone, Copy)]
@@ -469,6 +473,7 @@ impl<'a> Reader<'a> {
             asked_len: 0,
             runs: [Run::default(); RUNS],
             runs_len: 0,
+            touched: Touched::new(),
         }
     }
 
@@ -497,10 +502,7 @@ impl<'a> Reader<'a> {
     pub fn flush(&mut self, sums: &mut Sums) {
         for index in 0..self.asked_len {
             for row in self.rows() {
-                self.find_run(index, row);
-                if self.runs_len == RUNS {
-                    self.read(sums);
-                }
+                self.find_runs(index, row, sums);
             }
         }
         self.read(sums);
@@ -530,14 +532,23 @@ impl<'a> Reader<'a> {
     }
 
     #[inline]
-    fn find_run(&mut self, asked: usize, row: usize) {
+    fn find_runs(&mut self, asked: usize, row: usize, sums: &mut Sums) {
+        let [first, cells, _] = self.blocks.extents[row];
+        let (start, end) = self.columns(row, first, cells);
+        for start in (start..end).step_by(RUN_CELLS) {
+            self.find_run(asked, row, (start, end.min(start + RUN_CELLS as u32)));
+            if self.runs_len == RUNS {
+                self.read(sums);
+            }
+        }
+    }
+
+    /// The run of the cells from `start` to `end` of a row of cells.
+    #[inline]
+    fn find_run(&mut self, asked: usize, row: usize, (start, end): (u32, u32)) {
         let blocks = self.blocks;
         let block = &self.asked[asked].block;
         let [first, cells, before] = blocks.extents[row];
-        let (start, end) = self.columns(row, first, cells);
-        if start >= end {
-            return;
-        }
         let rows = blocks.rows_of(block);
         let next = blocks.cell_base(block) + (before + start) as usize + 1;
         let offset = |cell: u32| {
@@ -571,7 +582,7 @@ impl<'a> Reader<'a> {
 
     /// Reads all runs.
     fn read(&mut self, sums: &mut Sums) {
-        let mut touched = Touched::new();
+        let Self { touched, .. } = self;
         for runs in self.runs[..self.runs_len].chunk_by(|a, b| a.asked == b.asked) {
             let Asked { block, weight } = &self.asked[runs[0].asked as usize];
             for run in runs {
@@ -615,29 +626,21 @@ impl Blocks {
         let cell = (1 << bits) as f32;
         let start = self.starts[block.index] as usize;
         let (begin, end) = (run.begin as usize, run.end as usize);
-        let y0 = f32x8::splat(run.y0);
-        let mut x0 = f32x8::splat(run.x0);
-        let mut next = run.next as usize;
-        let boundary = |next: usize| (run.row as usize) + self.offsets.get(next);
-        let mut cell_end = if next < run.last as usize {
-            boundary(next)
-        } else {
-            end
-        };
+        let (x0, y0) = (f32x8::splat(run.x0), f32x8::splat(run.y0));
+        // Where the cells behind the first begin. Every group is compared with all of them: a loop that goes on with the
+        // next one only when it begins takes a wrong guess for each.
+        let mut bounds = [0.0; RUN_CELLS];
+        let bounds = &mut bounds[..(run.last - run.next) as usize];
+        for (bound, next) in bounds.iter_mut().zip(run.next..run.last) {
+            *bound = (run.row as usize + self.offsets.get(next as usize)) as f32;
+        }
         for group in begin / GROUP..end.div_ceil(GROUP) {
             let first = group * GROUP;
             let words = self.words.group(start + group);
+            let elements = LANES + first as f32;
             let mut lanes_x0 = x0;
-            while cell_end < end.min(first + GROUP) {
-                let behind = LANES.cmp_ge(f32x8::splat((cell_end - first) as f32));
-                lanes_x0 += behind & f32x8::splat(cell);
-                x0 += f32x8::splat(cell);
-                next += 1;
-                cell_end = if next < run.last as usize {
-                    boundary(next)
-                } else {
-                    end
-                };
+            for &bound in bounds.iter() {
+                lanes_x0 += elements.cmp_ge(f32x8::splat(bound)) & f32x8::splat(cell);
             }
             let x = to_float(words >> shift & rest) + lanes_x0;
             let y = to_float(words >> (shift + bits) & rest) + y0;

@@ -94,7 +94,7 @@ pub struct Touched {
 }
 
 /// Room for whole groups of eight.
-const QUEUE: usize = 128;
+const QUEUE: usize = 64;
 
 impl Touched {
     pub fn new() -> Self {

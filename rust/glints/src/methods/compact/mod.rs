@@ -37,13 +37,16 @@
 //! levels, from the whole map down, as fit into [`BYTES_PER_TEXEL`].
 //!
 //! **Exactness** Quantisation is at most about a twentieth of a lobe's standard deviation (for alpha >= 0.003; below, where
-//! 32 bits do not suffice, a step grows to 1e-4), which is 1.5 % of relative L1 error for a single lobe, less for several.
-//! Counts and blurred borders cost up to 2.6 % on the maps of the scenes. Sampling, density and evaluation are exact
-//! partners: lobes are truncated for all three, and `sample` treats a texel as the cover of the footprint does.
+//! 32 bits do not suffice, a step grows to 1e-4), which is up to 1.9 % of relative L1 error for a single lobe, less for
+//! several. Counts and blurred borders cost up to 1.9 % for footprints of a quarter of a thousand texels' width and more on
+//! the maps of the scenes. Sampling, density and evaluation are exact partners: lobes are truncated for all three, and
+//! `sample` treats a texel as the cover of the footprint does.
 //!
-//! **Bounds** Evaluation takes under a microsecond or two for footprints of up to a hundred texels' width at low roughness, and
-//! some ten where counts answer. It grows with the area in between: where a footprint is too large for its texels and too
-//! small, or too thin, for counts, and at low roughness with the number of texels within reach.
+//! **Bounds** A footprint of one texel takes about a microsecond, and one that covers the map evenly less, where there are
+//! counts. In between, evaluation grows with the number of texels within reach, by some nanoseconds each, until the border
+//! may be blurred: that bounds low roughness by the texels of a few blocks, and high roughness by those of the cut squares.
+//! Most expensive are footprints of hundreds of texels' width, or long and thin ones, at high roughness: thousands of lobes
+//! matter, of which any subset would be off by more than 2 %, and squares with counts are not small against the footprint.
 //!
 //! **Files** A structure is saved with [`CompactBinMap::save`] and used in place after [`CompactBinMap::load`]; the format
 //! stands at the top of the module `file`.
@@ -84,8 +87,9 @@ pub use file::{Header, VERSION, is_saved, read_header};
 /// Share of a map's texels within reach of a typical half vector from which they are kept in the map's order.
 pub const ROUGH: f64 = 0.02;
 
-/// Most texels of a block within reach of a typical half vector.
-const NEAR_TEXELS: f64 = 250.0;
+/// Most texels of a block within reach of a typical half vector: a small footprint reads them all, and a large one pays for
+/// each block that it meets.
+const NEAR_TEXELS: f64 = 128.0;
 
 /// What the whole structure may take, 18 MB for 2048 x 2048 texels.
 pub const BYTES_PER_TEXEL: f64 = 18e6 / (2048.0 * 2048.0);
@@ -510,7 +514,7 @@ fn share_in_reach(map: &NormalMap, bounds: (Vec2, Vec2), lobe: &Lobe) -> f64 {
     }
     let concentration = histogram.iter().map(|n| n * n).sum::<f64>() / (count * count);
     let cells = std::f64::consts::PI * f64::from(lobe.reach() / grid.pitch).powi(2);
-    (concentration * cells.max(1.0)).min(1.0)
+    (concentration * cells).min(1.0)
 }
 
 /// Standard deviation of a flake's slopes.

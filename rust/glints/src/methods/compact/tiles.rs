@@ -119,6 +119,7 @@ struct Asked {
 struct Batch {
     asked: [Asked; BATCH],
     len: usize,
+    touched: Touched,
 }
 
 impl Batch {
@@ -126,6 +127,7 @@ impl Batch {
         Self {
             asked: [Asked::default(); BATCH],
             len: 0,
+            touched: Touched::new(),
         }
     }
 }
@@ -259,7 +261,6 @@ impl Tiles {
     /// Adds the texels of the tiles that wait.
     #[inline(never)]
     fn read(&self, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
-        let mut touched = Touched::new();
         let alike = if weight.cuts.is_empty() { weight.base } else { 1.0 };
         for asked in &batch.asked[..batch.len] {
             let (column, row) = (asked.column, asked.row);
@@ -272,11 +273,11 @@ impl Tiles {
                 let columns = LANES + (column * SIDE) as f32;
                 self.for_each_found((column, row), texels, window, sums, |sums, near, k| {
                     let rows = f32x8::splat((row * SIDE + k) as f32);
-                    touched.add(near, [columns, rows], weight, sums);
+                    batch.touched.add(near, [columns, rows], weight, sums);
                 });
             }
         }
-        touched.flush(weight, sums);
+        batch.touched.flush(weight, sums);
         batch.len = 0;
     }
 
