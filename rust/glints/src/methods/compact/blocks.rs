@@ -16,7 +16,7 @@
 //! from the sorted order to places. Munro, Raman, Raman, Rao: *Succinct representations of permutations and functions*
 //! (2012), Section 2: following pi around its cycle from any place leads back to it in the end; one in [`STRIDE`]
 //! elements has a pointer to the previous such one on its cycle, which shortens the way to about `2 STRIDE` steps for one
-//! bit a texel.
+//! bit a texel. A pointer is the number of another element that has one, so that 16 bits suffice.
 //!
 //! **Query** Of every block that meets the footprint, the words of the few cells within reach of the half vector, eight at a
 //! time.

@@ -229,7 +229,7 @@ impl<'a> Border<'a> {
 
     /// Positions of the middles of texels from the footprint's; columns and rows are whole, and their difference exact.
     #[inline(always)]
-    fn from_middle(&self, columns: f32x8, rows: f32x8) -> (f32x8, f32x8) {
+    fn relative(&self, columns: f32x8, rows: f32x8) -> (f32x8, f32x8) {
         (
             columns - self.origin[0] + self.offset[0],
             rows - self.origin[1] + self.offset[1],
@@ -239,7 +239,7 @@ impl<'a> Border<'a> {
     /// Which of eight texels are not outside, and which are inside.
     #[inline(always)]
     fn sides(&self, columns: f32x8, rows: f32x8) -> (u32, u32) {
-        let (x, y) = self.from_middle(columns, rows);
+        let (x, y) = self.relative(columns, rows);
         let (mut outside, mut inside) = (f32x8::ZERO, f32x8::ONE.cmp_gt(f32x8::ZERO));
         for slab in &self.slabs {
             let s = slab.distance(x, y);
@@ -253,7 +253,7 @@ impl<'a> Border<'a> {
     /// Areas of texels inside the footprint, of those in `lanes`.
     #[inline]
     fn areas(&self, lanes: u32, columns: f32x8, rows: f32x8) -> f32x8 {
-        let (x, y) = self.from_middle(columns, rows);
+        let (x, y) = self.relative(columns, rows);
         let [s, t] = self.slabs.each_ref().map(|slab| {
             let distance = slab.distance(x, y);
             let is_cut = distance.cmp_gt(f32x8::splat(0.5 - slab.variation()));
@@ -280,7 +280,7 @@ impl<'a> Border<'a> {
     /// Bit `8 y + x`: the footprint may touch this one of the 8 x 8 texels from `(column, row)` on. It touches no other.
     #[inline]
     pub fn touched(&self, column: u32, row: u32) -> u64 {
-        let (x, y) = self.from_middle(f32x8::splat(column as f32), LANES + row as f32);
+        let (x, y) = self.relative(f32x8::splat(column as f32), LANES + row as f32);
         let (mut first, mut last) = (f32x8::splat(-1.0), f32x8::splat(8.0));
         for slab in &self.slabs {
             let middle = y * slab.shift - x;

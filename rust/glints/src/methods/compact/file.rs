@@ -30,7 +30,7 @@
 //! | 1 | 3 u32 | blocks: extents of the rows of cells |
 //! | 2 | u32 | blocks: where the rows of cells begin |
 //! | 3 | u16 or u32 | blocks: where the cells begin |
-//! | 4 | u16 | blocks: pointers of the permutations |
+//! | 4 | u16 | blocks: pointers of the permutations, each the number of another |
 //! | 16 + level | u8, u16 or u32 | counts of a level, with its padding |
 //!
 //! Whatever changes these arrays, or a constant that queries of them rely on, takes another version.

@@ -6,9 +6,9 @@ use wide::{f32x8, u32x8};
 pub const LANES: f32x8 = f32x8::new([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
 
 /// For every mask, its lanes in order, a byte each.
-static ORDER: [u64; 256] = order();
+static ORDER: [u64; 256] = orders();
 
-const fn order() -> [u64; 256] {
+const fn orders() -> [u64; 256] {
     let mut table = [0; 256];
     let mut mask = 0;
     while mask < 256 {
@@ -25,13 +25,18 @@ const fn order() -> [u64; 256] {
     table
 }
 
+/// The lanes of `mask` in order, a byte each.
+#[inline(always)]
+pub fn order(mask: u32) -> u64 {
+    ORDER[mask as usize & 0xff]
+}
+
 /// Writes the lanes of `mask`, one behind the other, to `queue` from `at` on; seven places behind them may be overwritten.
 ///
 /// No branch depends on the mask: those that count come without pattern, and a wrong guess costs more than eight lanes.
 #[inline(always)]
 pub fn compress<const N: usize>(mask: u32, values: f32x8, queue: &mut [f32; N], at: usize) {
-    let order = ORDER[mask as usize & 0xff];
-    *places(queue, at) = permuted(values, order).to_array();
+    *places(queue, at) = permuted(values, order(mask)).to_array();
 }
 
 #[cfg(all(target_arch = "x86_64", target_feature = "avx2"))]

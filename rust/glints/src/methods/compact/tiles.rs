@@ -18,7 +18,7 @@ use super::array::Array;
 use super::border::{Border, Touched, Weight};
 use super::cover::Rect;
 use super::grid::Grid;
-use super::lanes::LANES;
+use super::lanes::{LANES, order};
 use super::lobes::{Near, Sums};
 use super::packing::{prefetch, to_float, widened};
 use crate::normal_map::NormalMap;
@@ -261,49 +261,29 @@ impl Tiles {
     /// Adds the texels of the tiles that wait.
     #[inline(never)]
     fn read(&self, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
+        let found = Rows::new(batch, |tile| {
+            let (column, row) = (tile.column, tile.row);
+            window.find(upper(self.tile(column, row))) & tile.texels & self.within(column, row)
+        });
         let alike = if weight.cuts.is_empty() { weight.base } else { 1.0 };
-        for asked in &batch.asked[..batch.len] {
-            let (column, row) = (asked.column, asked.row);
-            let texels = asked.texels & self.within(column, row);
-            if asked.inside {
-                self.for_each_found((column, row), texels, window, sums, |sums, near, _| {
-                    sums.add_alike(near.lanes, near.x, near.y, alike);
-                });
+        let Batch { asked, touched, .. } = batch;
+        for (slot, k, lanes) in found.iter() {
+            let Asked {
+                column, row, inside, ..
+            } = asked[slot];
+            let tile = self.tile(column, row);
+            let (x, y) = self.cells(tile, upper(tile), k as usize);
+            let lanes = lanes & sums.near(x, y);
+            if inside {
+                sums.add_alike(lanes, x, y, alike);
             } else {
                 let columns = LANES + (column * SIDE) as f32;
-                self.for_each_found((column, row), texels, window, sums, |sums, near, k| {
-                    let rows = f32x8::splat((row * SIDE + k) as f32);
-                    batch.touched.add(near, [columns, rows], weight, sums);
-                });
+                let rows = f32x8::splat((row * SIDE + k) as f32);
+                touched.add(&Near { lanes, x, y }, [columns, rows], weight, sums);
             }
         }
-        batch.touched.flush(weight, sums);
+        touched.flush(weight, sums);
         batch.len = 0;
-    }
-
-    /// Calls `visit` with the rows of a tile that have texels within reach, of `texels`.
-    #[inline(always)]
-    fn for_each_found(
-        &self,
-        (column, row): (u32, u32),
-        texels: u64,
-        window: &Window,
-        sums: &mut Sums,
-        mut visit: impl FnMut(&mut Sums, &Near, u32),
-    ) {
-        let tile = self.tile(column, row);
-        let upper: &[u8; 4 * UPPER] = bytemuck::cast_slice(&tile[..UPPER])
-            .try_into()
-            .expect("the upper bytes");
-        let mut found = window.find(upper) & texels;
-        while found != 0 {
-            let row = found.trailing_zeros() / SIDE;
-            let lanes = (found >> (SIDE * row)) as u32 & 0xff;
-            found &= !(0xff << (SIDE * row));
-            let (x, y) = self.cells(tile, upper, row as usize);
-            let lanes = lanes & sums.near(x, y);
-            visit(sums, &Near { lanes, x, y }, row);
-        }
     }
 
     /// The texels of a tile that the map has.
@@ -352,6 +332,69 @@ impl Tiles {
     }
 }
 
+/// Rows of a batch's tiles that have texels within reach.
+///
+/// They are listed first, without a branch that depends on how many a tile has: a wrong guess costs more than a row.
+struct Rows {
+    found: [u64; BATCH],
+    /// The last eight places are for what is written beyond the end.
+    slots: [u8; ROWS],
+    rows: [u8; ROWS],
+    count: usize,
+}
+
+const ROWS: usize = BATCH * SIDE as usize + 8;
+
+impl Rows {
+    /// `find` tells which texels of a tile count.
+    #[inline(always)]
+    fn new(batch: &Batch, find: impl Fn(&Asked) -> u64) -> Self {
+        let mut list = Self {
+            found: [0; BATCH],
+            slots: [0; ROWS],
+            rows: [0; ROWS],
+            count: 0,
+        };
+        for (slot, tile) in batch.asked[..batch.len].iter().enumerate() {
+            let found = find(tile);
+            let rows = rows_with_any(found);
+            list.found[slot] = found;
+            list.slots[list.count..list.count + 8].fill(slot as u8);
+            list.rows[list.count..list.count + 8].copy_from_slice(&order(rows).to_le_bytes());
+            list.count += rows.count_ones() as usize;
+        }
+        list
+    }
+
+    /// Number of the tile in the batch, row, and which of its texels count.
+    #[inline(always)]
+    fn iter(&self) -> impl Iterator<Item = (usize, u32, u32)> {
+        let rows = self.slots[..self.count].iter().zip(&self.rows);
+        rows.map(|(&slot, &row)| {
+            let (slot, row) = (usize::from(slot) % BATCH, u32::from(row));
+            let lanes = (self.found[slot] >> (SIDE * row)) as u32 & 0xff;
+            (slot, row, lanes)
+        })
+    }
+}
+
+/// Bit k: byte k is not zero.
+#[inline(always)]
+fn rows_with_any(found: u64) -> u32 {
+    const LOW: u64 = 0x7f7f_7f7f_7f7f_7f7f;
+    let any = (((found & LOW) + LOW) | found) & !LOW;
+    // Bit 8 k meets bit 56 - 7 k of the factor at bit 56 + k, and no others do there.
+    ((any >> 7).wrapping_mul(0x0102_0408_1020_4080) >> 56) as u32
+}
+
+/// The upper bytes of a tile.
+#[inline(always)]
+fn upper(tile: &[u32]) -> &[u8; 4 * UPPER] {
+    bytemuck::cast_slice(&tile[..UPPER])
+        .try_into()
+        .expect("the upper bytes")
+}
+
 /// 32-bit units of a tile.
 const fn units(lower_bits: u32) -> usize {
     UPPER + 4 * lower_bits as usize
@@ -378,4 +421,20 @@ fn put(tile: &mut [u32], lower_bits: u32, texel: usize, [x, y]: [u32; 2]) {
 fn tiles_of(rect: &Rect) -> (Range<u32>, Range<u32>) {
     let tiles = |low: u32, high: u32| low / SIDE..high.div_ceil(SIDE);
     (tiles(rect.low.0, rect.high.0), tiles(rect.low.1, rect.high.1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn rows_are_told_apart(found: u64, masks: [bool; 8]) {
+            let kept = (0..8).filter(|&k| masks[k]).fold(0, |mask, k| mask | 0xff_u64 << (8 * k));
+            let bytes = (found & kept).to_le_bytes();
+            let expected = (0..8).filter(|&k| bytes[k] != 0).fold(0, |mask, k| mask | 1 << k);
+            prop_assert_eq!(rows_with_any(found & kept), expected);
+        }
+    }
 }
