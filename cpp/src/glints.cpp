@@ -179,10 +179,10 @@ Environment &Environment::operator=(Environment &&) noexcept = default;
 Environment::~Environment() = default;
 
 Environment Environment::fit(const std::vector<float> &directions, const std::vector<float> &weights, uint32_t lobes,
-                             float epsilon, uint64_t seed) {
+                             float epsilon, uint32_t candidates, uint64_t seed) {
     return translated([&] {
         return Environment(std::make_unique<Impl>(
-            Impl{bridge::environment(slice(directions), slice(weights), lobes, epsilon, seed)}));
+            Impl{bridge::environment(slice(directions), slice(weights), lobes, epsilon, candidates, seed)}));
     });
 }
 

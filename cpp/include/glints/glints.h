@@ -226,9 +226,10 @@ class GLINTS_API Environment {
 public:
     /// Fits at most `lobes` lobes to light from the unit vectors `directions`, three numbers each. `weights`: radiance
     /// times the solid angle that a direction stands for. `epsilon`, in (0, 1): a lobe's light counts as coming from
-    /// where it is above so many times its peak. Deterministic.
+    /// where it is above so many times its peak. `candidates`, 1 to 64: lobes of which a draw keeps one, at a range query
+    /// each. Deterministic.
     static Environment fit(const std::vector<float> &directions, const std::vector<float> &weights, uint32_t lobes,
-                           float epsilon = 0.3f, uint64_t seed = 0);
+                           float epsilon = 0.3f, uint32_t candidates = 8, uint64_t seed = 0);
 
     uint32_t lobe_count() const noexcept;
     Lobe lobe(uint32_t index) const noexcept;
@@ -258,10 +259,10 @@ private:
 /// `value / probability`, Fresnel term, colour and visibility along `wo`.
 struct LobeSample {
     uint32_t lobe;
-    float probability;
-    Vec3 wo;     ///< a direction from the lobe, in the local frame
-    float value; ///< f * cos(theta_o), averaged over the lobe
-    bool valid;  ///< false: nothing was drawn; counts as zero
+    float probability; ///< of the choice, or what stands for it among several candidates
+    Vec3 wo;           ///< a direction from the lobe, in the local frame
+    float value;       ///< f * cos(theta_o), averaged over the lobe
+    bool valid;        ///< false: nothing was drawn; counts as zero
 };
 
 /// A normal map filtered over footprints by one of the methods.

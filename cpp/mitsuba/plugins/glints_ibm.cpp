@@ -97,7 +97,7 @@ Guidance
 - The footprint comes from ray differentials. Render with `glints_path` (of this package) or with `direct`: Mitsuba's
   other integrators drop the differentials, and the BSDF then shows single texels and says so once.
 - With many samples per pixel Mitsuba shrinks the footprint to that of one sample; see `footprint` of `glints_path`.
-- Deeper vertices of a path have no footprint: a glinting surface seen in a mirror shows single texels.
+- Deeper vertices of a path have the footprint that `glints_path` carries to them; see its `indirect_footprint`.
 - The mesh needs uv coordinates, best without strong distortion: the tangent frame of the map follows them.
 - One-sided, like `roughconductor`: wrap it in `twosided` if both sides are seen.
 - In polarized variants the reflection depolarises.

@@ -29,9 +29,11 @@ differentials. Otherwise it renders what `path` renders: on scenes without glint
 | prefilter`      |                 | their NDF is averaged over the extent of a piece of the environment, instead of   |
 |                 |                 | being sampled. Far less noise, some bias. (Default: false)                        |
 | `environment_   | integer         | Number of those pieces, spherical Gaussians, at most 1024. More: less bias, more  |
-| lobes`          |                 | noise. (Default: 32)                                                              |
+| lobes`          |                 | noise. (Default: 128)                                                             |
 | `environment_   | float           | A piece extends to where its Gaussian has so many times its peak, in (0, 1).      |
 | epsilon`        |                 | (Default: 0.3)                                                                    |
+| `environment_   | integer         | Pieces that a sample considers, 1 to 64, to keep one of them by its reflection.   |
+| candidates`     |                 | Each costs a range query. (Default: 8)                                            |
 
 The footprint behind a bounce
 -----------------------------
@@ -53,8 +55,8 @@ Environment prefiltering
   sample of a scene is taken; the log says how long that took, and how much light the mixture has in other places than the
   map. Each direction's light is divided among the Gaussians, so energy is kept, in all colours. If the
   environment is changed afterwards, make a new integrator.
-- At a glint BSDF one Gaussian is drawn, by its energy times a cheap NDF, and a direction from it for shadows and Fresnel
-  term. The NDF is averaged over the rectangle of half vectors that the Gaussian's extent covers. Directions that the BSDF
+- At a glint BSDF one Gaussian is drawn, by its energy times a cheap NDF and among candidates by its reflection, and a
+  direction from it for shadows and Fresnel term. The NDF is averaged over the rectangle of half vectors that the Gaussian's extent covers. Directions that the BSDF
   draws count nothing when they meet the environment: there is no multiple importance sampling between the two ways.
   Other emitters, other materials and the visible background are as without prefiltering.
 - It needs range queries of the NDF: `glints_direct` and `glints_unfiltered` have them, alone or in `twosided`. Other glint
@@ -162,8 +164,9 @@ public:
     explicit GlintsPath(const Properties &props)
         : Base(props), m_footprint(props), m_indirect(props.get<float>("indirect_footprint", 1.f)),
           m_prefilter(props.get<bool>("environment_prefilter", false)),
-          m_lobes(unsigned_parameter(props, "environment_lobes", 32)),
-          m_epsilon(props.get<float>("environment_epsilon", .3f)) {
+          m_lobes(unsigned_parameter(props, "environment_lobes", 128)),
+          m_epsilon(props.get<float>("environment_epsilon", .3f)),
+          m_candidates(unsigned_parameter(props, "environment_candidates", 8)) {
         auto check = [&](bool right, const char *name, const char *domain) {
             if (!right)
                 Throw("%s: parameter \"%s\" is %s; it must be %s.", props.plugin_name(), name, props.as_string(name),
@@ -172,6 +175,7 @@ public:
         check(std::isfinite(m_indirect) && m_indirect >= 0.f, "indirect_footprint",
               "a factor that is finite and not negative, 0 to switch deeper footprints off");
         check(m_lobes >= 1 && m_lobes <= 1024, "environment_lobes", "a number of spherical Gaussians in [1, 1024]");
+        check(m_candidates >= 1 && m_candidates <= 64, "environment_candidates", "a number of candidates in [1, 64]");
         check(m_epsilon > 0.f && m_epsilon < 1.f, "environment_epsilon", "in (0, 1)");
     }
 
@@ -379,8 +383,8 @@ private:
             auto fits = [&](const auto &e) { return e->emitter() == scene->environment(); };
             auto found = std::find_if(m_environments.begin(), m_environments.end(), fits);
             if (found == m_environments.end())
-                found = m_environments.insert(found,
-                                              std::make_unique<Environment>("glints_path", scene, m_lobes, m_epsilon));
+                found = m_environments.insert(
+                    found, std::make_unique<Environment>("glints_path", scene, m_lobes, m_epsilon, m_candidates));
             known = found->get();
             m_environment.store(known, std::memory_order_release);
         }
@@ -392,6 +396,7 @@ private:
     bool m_prefilter;
     uint32_t m_lobes;
     float m_epsilon;
+    uint32_t m_candidates;
 
     mutable std::mutex m_mutex;
     mutable std::vector<std::unique_ptr<Environment>> m_environments; ///< of all scenes seen, kept for other threads

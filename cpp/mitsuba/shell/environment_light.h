@@ -26,7 +26,7 @@ public:
     MI_IMPORT_TYPES(Scene, Emitter, BSDF)
     using Sides = PrefilteredSides<Float, Spectrum>;
 
-    EnvironmentLight(const char *owner, const Scene *scene, uint32_t lobes, float epsilon)
+    EnvironmentLight(const char *owner, const Scene *scene, uint32_t lobes, float epsilon, uint32_t candidates)
         : m_emitter(const_cast<Emitter *>(scene->environment())) {
         find_bsdfs(owner, scene);
         mitsuba::Timer timer;
@@ -36,7 +36,7 @@ public:
             total += weight;
         if (!(total > 0.))
             return; // black: nothing to reflect, by either way
-        m_mixture.emplace(glints::Environment::fit(samples.directions, samples.weights, lobes, epsilon));
+        m_mixture.emplace(glints::Environment::fit(samples.directions, samples.weights, lobes, epsilon, candidates));
         m_energies = m_mixture->energies(samples.directions, samples.values, Channels);
         double residual = m_mixture->residual(samples.directions, samples.weights, samples.radiances);
         using mitsuba::ClassName, mitsuba::Info;
@@ -76,7 +76,7 @@ public:
 
 private:
     static constexpr uint32_t Channels = mitsuba::is_spectral_v<UnpolarizedSpectrum> ? MI_CIE_SAMPLES : 3;
-    static constexpr uint32_t GridSide = 181; ///< 32761 directions
+    static constexpr uint32_t GridSide = 128; ///< 16384 directions
 
     struct Samples {
         std::vector<float> directions, weights, radiances, values;

@@ -1,7 +1,7 @@
 // How an integrator tells the BSDFs that a missing footprint is no accident.
 //
 // A glint BSDF that sees no footprint warns, because stock integrators other than `direct` silently drop the ray
-// differentials it lives from. `glints_path` has footprints at the camera's vertex and, by design, none deeper down.
+// differentials it lives from. `glints_path` may have none behind the first bounce, by choice.
 #pragma once
 
 namespace glints_mitsuba {

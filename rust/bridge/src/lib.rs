@@ -289,6 +289,7 @@ mod ffi {
             weights: &[f32],
             lobes: u32,
             epsilon: f32,
+            candidates: u32,
             seed: u64,
         ) -> Result<Box<Environment>>;
         fn lobe_count(self: &Environment) -> u32;
@@ -880,6 +881,7 @@ fn environment(
     weights: &[f32],
     lobes: u32,
     epsilon: f32,
+    candidates: u32,
     seed: u64,
 ) -> Result<Box<Environment>> {
     guarded("lobes", &lobes.to_string(), || {
@@ -890,7 +892,7 @@ fn environment(
         };
         let mixture = SphericalGaussians::fit(light, lobes as usize, seed)?;
         Ok(Box::new(Environment(prefilter::Environment::new(
-            mixture, epsilon,
+            mixture, epsilon, candidates,
         )?)))
     })
 }

@@ -13,7 +13,9 @@
 //!
 //! **Choice of the lobe** By its energy times a cheap NDF, a Gaussian with the slopes' covariance of the whole
 //! map, of a flake and of the lobe; a tenth of the draws goes by energy alone, so that no weight is more than
-//! ten times that of such draws, however the footprint differs from the map.
+//! ten times that of such draws, however the footprint differs from the map. What one footprint shows of the map
+//! may differ much: several candidates are drawn so, stratified, and one of them is kept in proportion to its
+//! reflection (resampled importance sampling; Talbot et al. 2005), which costs a range query each.
 //!
 //! **What is exact, and what is not** The sum over lobes is unbiased, choice and shadows included. The mean over the
 //! rectangle is the approximation: light is moved within its lobe's support. The part of the rectangle outside the
@@ -23,36 +25,52 @@
 
 use std::f32::consts::TAU;
 
+use arrayvec::ArrayVec;
 use glam::{Mat3, Vec2, Vec3};
 
-use crate::brdf::Brdf;
+use crate::brdf::{Brdf, four_uniforms};
 use crate::error::{Error, Result};
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
 use crate::half_vector_range::half_vector_rectangle;
 use crate::microfacet::Flake;
 use crate::normal_map::NormalMap;
-use crate::spherical_gaussians::{SphericalGaussian, SphericalGaussians};
+use crate::spherical_gaussians::{MAX_LOBES, SphericalGaussian, SphericalGaussians};
 
 /// Share of the draws that chooses lobes by their energy alone.
 const DEFENSIVE: f32 = 0.1;
 
+/// Most candidates of a draw.
+pub const MAX_CANDIDATES: usize = 64;
+
 /// Least cosine of a half vector that the cheap NDF is evaluated at.
 const LEAST_COSINE: f32 = 0.05;
+
+/// One number a lobe.
+type Probabilities = ArrayVec<f32, MAX_LOBES>;
 
 /// A mixture and the supports of its lobes.
 #[derive(Clone, Debug)]
 pub struct Environment {
     mixture: SphericalGaussians,
     support_cos: Vec<f32>,
+    candidates: u32,
 }
 
 impl Environment {
     /// `epsilon` in (0, 1): the supports are where the lobes are above so many times their peaks (the paper's 0.3).
+    /// `candidates` in [1, [`MAX_CANDIDATES`]]: lobes that a draw looks at.
     ///
     /// # Errors
-    /// `epsilon` outside its domain.
-    pub fn new(mixture: SphericalGaussians, epsilon: f32) -> Result<Self> {
+    /// `epsilon` or `candidates` outside its domain.
+    pub fn new(mixture: SphericalGaussians, epsilon: f32, candidates: u32) -> Result<Self> {
+        if !(1..=MAX_CANDIDATES as u32).contains(&candidates) {
+            return Err(Error::Parameter {
+                name: "candidates",
+                value: candidates.to_string(),
+                reason: format!("must be a number of lobes in [1, {MAX_CANDIDATES}]"),
+            });
+        }
         if !(epsilon > 0.0 && epsilon < 1.0) {
             return Err(Error::parameter(
                 "epsilon",
@@ -65,7 +83,11 @@ impl Environment {
             .iter()
             .map(|lobe| lobe.support_cos(epsilon))
             .collect();
-        Ok(Self { mixture, support_cos })
+        Ok(Self {
+            mixture,
+            support_cos,
+            candidates,
+        })
     }
 
     pub fn mixture(&self) -> &SphericalGaussians {
@@ -85,7 +107,8 @@ pub struct Prefilter {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LobeSample {
     pub lobe: usize,
-    /// Of the choice of the lobe, positive.
+    /// Of the choice of the lobe, positive; among several candidates what stands for it (a random number then, above
+    /// one where a candidate was lucky).
     pub probability: f32,
     /// A direction of the lobe above the horizon, in the local frame.
     pub wo: Vec3,
@@ -120,21 +143,64 @@ impl Prefilter {
         if wi.z.is_nan() || wi.z <= 0.0 {
             return None;
         }
-        let (lobe, probability) = self.choose(wi, to_local, environment, u[0])?;
+        let probabilities = self.probabilities(wi, to_local, environment)?;
+        let count = environment.candidates;
+        let candidate = |index: u32| {
+            // Strata for the lobes; an additive recurrence for the directions (Roberts 2018).
+            let shifted = |u: f32, step: f32| (u + index as f32 * step).fract();
+            let u = [
+                (index as f32 + u[0]) / count as f32,
+                shifted(u[1], 0.754_877_7),
+                shifted(u[2], 0.569_840_3),
+            ];
+            let lobe = choose(&probabilities, u[0])?;
+            let (wo, value) = self.reflect(brdf, footprint, wi, to_local, environment, lobe, [u[1], u[2]])?;
+            Some(LobeSample {
+                lobe,
+                probability: probabilities[lobe],
+                wo,
+                value,
+            })
+        };
+        if count == 1 {
+            return candidate(0);
+        }
+        // The reflection of each, by the luminance of its lobe.
+        let reflected = |s: &LobeSample| environment.mixture.weights()[s.lobe] * s.value / s.probability;
+        let candidates: ArrayVec<LobeSample, MAX_CANDIDATES> = (0..count).filter_map(candidate).collect();
+        let total: f32 = candidates.iter().map(reflected).sum();
+        let mut rest = four_uniforms(u)[0] * total;
+        let mut visible = candidates.iter().filter(|s| s.value > 0.0);
+        let found = visible.clone().find(|s| {
+            rest -= reflected(s);
+            rest < 0.0
+        });
+        // Rounding may leave a rest behind the last one.
+        let kept = found.or_else(|| visible.next_back())?;
+        let probability = environment.mixture.weights()[kept.lobe] * kept.value * count as f32 / total;
+        Some(LobeSample { probability, ..*kept })
+    }
+
+    /// A direction of the lobe, and its reflection.
+    #[allow(clippy::too_many_arguments)]
+    fn reflect(
+        &self,
+        brdf: &Brdf,
+        footprint: &Footprint,
+        wi: Vec3,
+        to_local: &Mat3,
+        environment: &Environment,
+        lobe: usize,
+        u: [f32; 2],
+    ) -> Option<(Vec3, f32)> {
         let local = local_lobe(&environment.mixture.lobes()[lobe], to_local);
-        let wo = local.sample([u[1], u[2]]);
+        let wo = local.sample(u);
         let pair = DirectionPair::new(wi, wo)?;
-        let cos = environment.support_cos[lobe];
-        let value = match half_vector_rectangle(wi, local.axis, cos) {
+        let value = match half_vector_rectangle(wi, local.axis, environment.support_cos[lobe]) {
             Some((low, high)) => self.averaged(brdf, footprint, &pair, low, high)?,
             None => brdf.evaluate(footprint, wi, wo).value,
         };
-        Some(LobeSample {
-            lobe,
-            probability,
-            wo,
-            value,
-        })
+        Some((wo, value))
     }
 
     /// `G / (4 (i . n))` times the mean of the NDF over the part of the rectangle inside the disk.
@@ -152,21 +218,20 @@ impl Prefilter {
         Some(mean / inside * flake * brdf.masking(pair) / (4.0 * pair.wi.z))
     }
 
-    /// A lobe and its probability.
-    fn choose(&self, wi: Vec3, to_local: &Mat3, environment: &Environment, u: f32) -> Option<(usize, f32)> {
+    /// The probabilities of the lobes, which sum to one; `None` if no lobe has light above the horizon.
+    fn probabilities(&self, wi: Vec3, to_local: &Mat3, environment: &Environment) -> Option<Probabilities> {
         let mixture = &environment.mixture;
-        let scores = || {
-            mixture
-                .lobes()
-                .iter()
-                .zip(mixture.weights())
-                .map(|(lobe, &weight)| {
-                    let local = local_lobe(lobe, to_local);
-                    let light = weight * share_above_horizon(&local);
-                    (light, light * self.cheap_ndf(wi, &local))
-                })
-        };
-        let (light, guided) = scores().fold((0.0, 0.0), |sum: (f32, f32), s| (sum.0 + s.0, sum.1 + s.1));
+        let lobes = mixture.lobes().iter().zip(mixture.weights());
+        let scores: ArrayVec<(f32, f32), MAX_LOBES> = lobes
+            .map(|(lobe, &weight)| {
+                let local = local_lobe(lobe, to_local);
+                let light = weight * share_above_horizon(&local);
+                (light, light * self.cheap_ndf(wi, &local))
+            })
+            .collect();
+        let (light, guided) = scores
+            .iter()
+            .fold((0.0, 0.0), |sum: (f32, f32), s| (sum.0 + s.0, sum.1 + s.1));
         if light.is_nan() || light <= 0.0 {
             return None;
         }
@@ -175,19 +240,8 @@ impl Prefilter {
         } else {
             (1.0 / light, 0.0)
         };
-        let mut rest = u;
-        let mut last = None;
-        for (lobe, (light, guided)) in scores().enumerate() {
-            let probability = light * by_light + guided * by_guide;
-            if probability > 0.0 {
-                last = Some((lobe, probability));
-                rest -= probability;
-                if rest < 0.0 {
-                    break;
-                }
-            }
-        }
-        last
+        let probability = |&(light, guided): &(f32, f32)| light * by_light + guided * by_guide;
+        Some(scores.iter().map(probability).collect())
     }
 
     /// The NDF of Gaussian slopes of map, flake and lobe at the lobe's half vector, per solid angle.
@@ -207,6 +261,17 @@ impl Prefilter {
         let form = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant;
         (-0.5 * form).exp() / (TAU * determinant.sqrt() * cos2 * cos2)
     }
+}
+
+/// The lobe under `u` in the cumulated probabilities.
+fn choose(probabilities: &Probabilities, u: f32) -> Option<usize> {
+    let mut rest = u;
+    let found = probabilities.iter().position(|probability| {
+        rest -= probability;
+        rest < 0.0
+    });
+    // Rounding may leave a rest behind the last one.
+    found.or_else(|| probabilities.iter().rposition(|&probability| probability > 0.0))
 }
 
 fn local_lobe(lobe: &SphericalGaussian, to_local: &Mat3) -> SphericalGaussian {
@@ -274,7 +339,7 @@ mod tests {
             directions: &directions,
             weights: &weights,
         };
-        Environment::new(SphericalGaussians::fit(light, lobes, 3).unwrap(), 0.3).unwrap()
+        Environment::new(SphericalGaussians::fit(light, lobes, 3).unwrap(), 0.3, 1).unwrap()
     }
 
     fn surface(alpha: f32) -> (Brdf, Prefilter) {
@@ -392,13 +457,14 @@ mod tests {
         let environment = environment(|x| 0.1 + (4.0 * x.x + 3.0 * x.z).exp(), 12);
         let wi = Vec3::new(-0.4, 0.1, 1.0).normalize();
         let (brdf, prefilter) = &surface;
-        let (mut chosen, mut probabilities) = (vec![0.0; 12], vec![0.0; 12]);
+        let mut chosen = vec![0.0; 12];
+        let probabilities = prefilter
+            .probabilities(wi, &Mat3::IDENTITY, &environment)
+            .unwrap();
         const DRAWS: usize = 100_000;
         for i in 0..DRAWS {
             let u = (i as f32 + 0.5) / DRAWS as f32;
-            let (lobe, p) = prefilter.choose(wi, &Mat3::IDENTITY, &environment, u).unwrap();
-            chosen[lobe] += 1.0 / DRAWS as f32;
-            probabilities[lobe] = p;
+            chosen[choose(&probabilities, u).unwrap()] += 1.0 / DRAWS as f32;
         }
         for (frequency, probability) in chosen.iter().zip(&probabilities) {
             assert_relative_eq!(frequency, probability, epsilon = 1e-4);
@@ -421,11 +487,28 @@ mod tests {
         assert!(draws.all(|u| sample(u).is_none()));
     }
 
+    /// The same mean with candidates, with far less scatter where a footprint differs from the map.
+    #[test]
+    fn candidates_change_the_noise_alone() {
+        let surface = surface(0.02);
+        let one = environment(|x| 0.1 + (4.0 * x.x + 3.0 * x.z).exp(), 24);
+        let wi = Vec3::new(-0.4, 0.1, 1.0).normalize();
+        let several = Environment {
+            candidates: 8,
+            ..one.clone()
+        };
+        let (mean, error) = reflected(&surface, 0.05, wi, &one);
+        let (found, less) = reflected(&surface, 0.05, wi, &several);
+        println!("candidates: {mean} +- {error}, {found} +- {less}");
+        assert!((found - mean).abs() < 4.0 * (error.hypot(less)));
+        assert!(error < 0.1 * mean && less < 0.6 * error, "{error} {less}");
+    }
+
     #[test]
     fn epsilon_outside_its_domain_is_refused() {
         let mixture = environment(|_| 1.0, 2).mixture;
         for epsilon in [0.0, 1.0, f32::NAN] {
-            let message = Environment::new(mixture.clone(), epsilon)
+            let message = Environment::new(mixture.clone(), epsilon, 1)
                 .unwrap_err()
                 .to_string();
             assert!(message.contains("\"epsilon\""), "{message}");
