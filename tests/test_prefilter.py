@@ -28,6 +28,7 @@ def scene(material, light, prefilter, samples, resolution=8, **parameters):
         "footprint": "pixel",
         "environment_prefilter": prefilter,
         "environment_lobes": 32,
+        "environment_candidates": 2,
         **parameters,
     }
     return plane_scene(material, integrator, resolution, samples, light=light)
@@ -44,16 +45,16 @@ def mean_and_error(images):
 
 @pytest.fixture
 def material(make_map):
-    return bsdf("glints_direct", make_map(random_normals(64, 64, 0.2, seed=2)), alpha=0.05)
+    return bsdf("glints_direct", make_map(random_normals(32, 32, 0.2, seed=2)), alpha=0.05)
 
 
 def test_constant_light_keeps_its_energy(material):
     """Furnace: the lobes' rectangles cover the half vectors evenly to 10 %, whatever the footprint shows of the NDF."""
     light = {"type": "constant", "radiance": 1.0}
     expected, _ = mean_and_error(rendered(scene(material, light, False, 16), range(4)))
-    mean, error = mean_and_error(rendered(scene(material, light, True, 64), range(4)))
+    mean, error = mean_and_error(rendered(scene(material, light, True, 16), range(4)))
     print(f"constant: {mean:.4f} +- {error:.4f}, unprefiltered {expected:.4f}, bias {mean / expected - 1:+.3f}")
-    assert error < 0.01 * mean
+    assert error < 0.02 * mean
     assert mean == pytest.approx(expected, rel=0.1)
 
 
@@ -72,11 +73,17 @@ def test_a_studio_has_less_noise_and_little_bias(material, tmp_path):
         for x in (0, 4)
     ]
     print(f"studio: variance {noise:.3f}, bias {mean / expected - 1:+.3f} +- {error / expected:.3f}, crops {crops}")
-    assert noise < 0.3
+    assert noise < 0.6
     assert mean == pytest.approx(expected, rel=0.1)
     # Twin: an extent that covers far more than the lobes loses the shape of the light.
     wide = rendered(scene(material, light, True, 64, environment_epsilon=1e-30), range(2))
-    assert abs(wide.mean() / expected - 1) > 0.2
+    truth = reference.mean(axis=0)
+
+    def distance(images):
+        return math.sqrt(((images.mean(axis=0) - truth) ** 2).mean()) / expected
+
+    print(f"rms distance {distance(smooth):.3f}, twin {distance(wide):.3f}")
+    assert distance(wide) > 2 * distance(smooth)
 
 
 def test_nothing_is_counted_twice(material, tmp_path):
@@ -115,6 +122,7 @@ def test_colours_are_kept(make_map, variant):
             "footprint": "pixel",
             "environment_prefilter": prefilter,
             "environment_lobes": 32,
+            "environment_candidates": 1,
         }
         for side in (3, -3):
             made = plane_scene(material, integrator, 8, 64, light=light)
