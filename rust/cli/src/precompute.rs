@@ -111,6 +111,7 @@ fn tensor(arguments: &TensorArguments) -> Result<()> {
         "mean_rank": structure.mean_rank(),
         "iterations": report.iterations,
         "relative_error": report.relative_error,
+        "level_errors": report.errors.iter().map(|error| error.0).collect::<Vec<_>>(),
         "image_bytes": image_bytes,
         "exact_bytes": exact_bytes,
     });

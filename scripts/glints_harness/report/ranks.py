@@ -9,7 +9,7 @@ from .text import bytes_text, number, seconds_text
 QUANTITIES = {
     "precompute": ("value", "precomputation (s)", seconds_text),
     "storage": ("ratio", "storage ÷ uncompressed images", number),
-    "ndf_error": ("value", "relative L2 error of the images", number),
+    "ndf_error": ("value", "relative L1 error of the finest images", number),
     "frame_error": ("ratio", "relative squared error of the picture", number),
     "frame_eval_ratio": ("value", "evaluation only: time ÷ roughconductor", number),
     "frame_sample_ratio": ("value", "sampling only: time ÷ roughconductor", number),
@@ -68,7 +68,7 @@ def rank_table(ranks):
         Column("precomputation", "s"),
         Column("compressed images"),
         Column("÷ uncompressed"),
-        Column("error of the images", "relative L2"),
+        Column("error of the finest images", "relative L1"),
         Column("error of the picture", "radiance²"),
         Column("÷ its mean square"),
         Column("evaluation", "÷ roughconductor"),
