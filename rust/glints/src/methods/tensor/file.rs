@@ -206,6 +206,7 @@ impl Tensor {
         folder: &Path,
         progress: &(dyn Fn(f64) + Sync),
     ) -> Result<(Self, Option<Report>)> {
+        super::check(model, options)?;
         let path = cache_path(map, model, options, folder);
         if path.is_file() {
             return Ok((Self::load(&path)?.0, None));

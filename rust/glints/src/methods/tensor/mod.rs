@@ -173,11 +173,7 @@ impl Tensor {
         options: &Options,
         progress: &(dyn Fn(f64) + Sync),
     ) -> Result<(Self, Report)> {
-        options.check()?;
-        if model.normalization != Normalization::Projected {
-            let reason = "a position-normal distribution is one of projected area; leave the parameter out";
-            return Err(Error::parameter("normalization", "paper", reason));
-        }
+        check(model, options)?;
         let lobes = Lobes::new(&model.flake, options.resolution);
         let (images, report) = build::build(map, lobes, options, progress);
         // As a file holds it, so that what is loaded answers as what was saved.
@@ -235,6 +231,14 @@ impl Tensor {
         }
         value
     }
+}
+
+fn check(model: FlakeModel, options: &Options) -> Result<()> {
+    if model.normalization != Normalization::Projected {
+        let reason = "a position-normal distribution is one of projected area; leave the parameter out";
+        return Err(Error::parameter("normalization", "paper", reason));
+    }
+    options.check()
 }
 
 /// The parallelogram whose covariance is that of a footprint's Gaussian: a box of width w has a variance of `w^2 / 12`.

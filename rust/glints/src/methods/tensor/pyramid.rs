@@ -60,10 +60,12 @@ impl Axis {
         let p = position / self.spacing();
         let first = p.floor();
         let fraction = p - first;
-        let node = |k: f64| (k.rem_euclid(f64::from(self.kept)) as u32).min(self.kept - 1);
         if self.kept == 1 {
             return [(0, 1.0), (0, 0.0)];
         }
+        // Remainders of floating-point numbers are slow, and these are asked for in every query.
+        let kept = f64::from(self.kept);
+        let node = |k: f64| ((k - (k * (1.0 / kept)).floor() * kept).max(0.0) as u32).min(self.kept - 1);
         [(node(first), 1.0 - fraction), (node(first + 1.0), fraction)]
     }
 

@@ -97,7 +97,12 @@ impl Taps {
             };
         }
         let sigma = variance.sqrt();
-        let axis = DVec2::from_angle(0.5 * q.xy.atan2(difference)) * sigma;
+        // The major axis: of the two rows of the covariance less its smaller eigenvalue, the longer one.
+        let (x, y) = (
+            DVec2::new(difference + root, q.xy),
+            DVec2::new(q.xy, root - difference),
+        );
+        let axis = if difference >= 0.0 { x } else { y }.normalize_or(DVec2::X) * sigma;
         // Variance that the taps' distances make up for: d1^2 + d2^2 of taps at +-d1 +-d2.
         let excess = major / variance - 1.0;
         let d2 = ((excess - 1.0).max(0.0) / (LARGEST_RATIO2 - 2.0)).min(1.0);
