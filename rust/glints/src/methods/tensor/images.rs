@@ -44,11 +44,8 @@ pub const LARGEST_FACTOR: f32 = 2047.0;
 /// Largest magnitude of a quantised Z.
 pub const LARGEST_ROW: f32 = 32_767.0;
 
-/// Elements after the last one of an array that is read eight at a time.
-pub const PADDING: usize = 8;
-
-/// Vectors of eight components.
-const CHUNKS: usize = MAX_RANK / 8;
+/// Elements after the last one of an array whose components are read as if there were [`MAX_RANK`].
+pub const PADDING: usize = MAX_RANK;
 
 /// Elements of a group of a rank with so many rows.
 pub fn elements(rank: usize, rows: usize) -> usize {
@@ -159,6 +156,8 @@ pub struct Images {
     members: Members,
     parts: Parts,
     groups: Vec<Group>,
+    /// Vectors of eight components of the largest rank: 1, 2, 4 or 8.
+    chunks: usize,
     /// Group of each region and block plus one, or zero.
     lookup: Vec<u32>,
     /// First mass of each image, and the end.
@@ -167,14 +166,26 @@ pub struct Images {
     inv_totals: Vec<f32>,
 }
 
-/// Products of rows, columns and scales of one group for a few pixels.
-struct Products<const N: usize> {
-    values: [[f32x8; CHUNKS]; N],
-    chunks: usize,
+/// All components of something, in vectors of eight; C is as large as the largest rank asks for. Beyond a group's rank there is
+/// whatever follows it; its scales are zero there.
+type Components<const C: usize> = [f32x8; C];
+
+/// A block's part of a point query: pixels side by side, with the weights of rows and columns.
+#[derive(Clone, Copy, Debug, Default)]
+struct Corner {
+    block: u32,
+    rows: Line,
+    columns: Line,
 }
 
-/// A block's part of a query: pixels with their weights.
-type Corner = (u32, ArrayVec<(usize, usize, f32), 4>);
+/// One or two pixels of a block along an axis.
+#[derive(Clone, Copy, Debug, Default)]
+struct Line {
+    block: u32,
+    first: usize,
+    count: usize,
+    weights: [f32; 2],
+}
 
 /// Along one axis, which pixels of a block count how much: all of a range once, some by their weights.
 #[derive(Clone, Debug, Default)]
@@ -218,6 +229,11 @@ impl Images {
             geometry,
             members,
             parts,
+            chunks: groups
+                .iter()
+                .map(|group| (group.rank as usize).div_ceil(8).next_power_of_two())
+                .max()
+                .unwrap_or(1),
             groups,
             lookup,
             starts,
@@ -229,11 +245,13 @@ impl Images {
         &self.parts
     }
 
+    #[cfg(test)]
     pub fn groups(&self) -> &[Group] {
         &self.groups
     }
 
     /// The row of an image in a group, if it has one.
+    #[cfg(test)]
     pub fn row_of(&self, group: usize, image: u32) -> Option<usize> {
         let local = self.members.local[image as usize] as usize;
         let same = self.members.region[image as usize] == self.groups[group].region;
@@ -266,45 +284,87 @@ impl Images {
     }
 
     /// The same without clamping: what range queries average.
+    #[cfg(test)]
     pub fn raw_density(&self, blend: &Blend, p: Vec2) -> f32 {
         self.blended(blend, p, |value| value)
     }
 
     #[inline(always)]
     fn blended(&self, blend: &Blend, p: Vec2, counts: impl Fn(f32) -> f32) -> f32 {
-        let mut sum = 0.0;
-        for (block, pixels) in self.corners(p) {
-            let mut known = None;
-            for &(image, weight) in blend {
-                let Some((index, row)) = self.find(image, block) else {
-                    continue;
-                };
-                let group = &self.groups[index];
-                if known.as_ref().is_none_or(|(i, _)| *i != index) {
-                    known = Some((index, self.products(group, &pixels)));
-                }
-                let Some((_, products)) = &known else { continue };
-                let z = self.row(group, row);
-                let mut value = 0.0;
-                for (k, (_, _, tent)) in pixels.iter().enumerate() {
-                    value += tent * counts(products.dot(k, &z));
-                }
-                sum += weight * self.inv_totals[image as usize] * value;
-            }
-        }
+        let corners = self.corners(p);
+        let sum = match self.chunks {
+            1 => self.sum_corners::<1>(blend, &corners, counts),
+            2 => self.sum_corners::<2>(blend, &corners, counts),
+            4 => self.sum_corners::<4>(blend, &corners, counts),
+            _ => self.sum_corners::<8>(blend, &corners, counts),
+        };
         sum * self.densities()
     }
 
+    #[inline]
+    fn sum_corners<const C: usize>(
+        &self,
+        blend: &Blend,
+        corners: &[Corner],
+        counts: impl Fn(f32) -> f32,
+    ) -> f32 {
+        let arrays = Arrays::new(&self.parts);
+        let mut sum = 0.0;
+        for corner in corners {
+            let mut known = usize::MAX;
+            let mut products = [[f32x8::ZERO; C]; 4];
+            for &(image, weight) in blend {
+                let Some((index, row)) = self.find(image, corner.block) else {
+                    continue;
+                };
+                let group = &self.groups[index];
+                if known != index {
+                    known = index;
+                    arrays.multiply(group, corner, &mut products);
+                }
+                let z: Components<C> = arrays.line(group, 2 * BLOCK + row);
+                let mut value = 0.0;
+                for (i, wy) in corner.rows.weights.iter().enumerate().take(corner.rows.count) {
+                    for (j, wx) in corner
+                        .columns
+                        .weights
+                        .iter()
+                        .enumerate()
+                        .take(corner.columns.count)
+                    {
+                        value += wy * wx * counts(dot(&products[2 * i + j], &z));
+                    }
+                }
+                sum += weight * self.inv_total(image) * value;
+            }
+        }
+        sum
+    }
+
+    /// One over an image's total; zero for one without energy.
+    #[inline]
+    fn inv_total(&self, image: u32) -> f32 {
+        self.inv_totals[image as usize]
+    }
+
     /// The density of one image at a pixel as reconstructed, negative values included, not normalised.
+    #[cfg(test)]
     pub fn raw(&self, image: u32, column: u32, row: u32) -> f32 {
         let side = BLOCK as u32;
-        let block = row / side * self.geometry.blocks() + column / side;
-        self.find(image, block).map_or(0.0, |(index, z)| {
-            let group = &self.groups[index];
-            let pixel = [((row % side) as usize, (column % side) as usize, 1.0)];
-            self.products(group, &pixel.into_iter().collect())
-                .dot(0, &self.row(group, z))
-        })
+        let line = |i: u32| Line {
+            block: i / side,
+            first: (i % side) as usize,
+            count: 1,
+            weights: [1.0, 0.0],
+        };
+        let corner = Corner {
+            block: row / side * self.geometry.blocks() + column / side,
+            rows: line(row),
+            columns: line(column),
+        };
+        let blend = std::iter::once((image, 1.0)).collect();
+        let total = self.parts.totals[image as usize];
+        total * self.sum_corners::<8>(&blend, &[corner], |value| value)
     }
 
     /// From shares of an image to densities: one over the area of a pixel.
@@ -313,29 +373,51 @@ impl Images {
         1.0 / (pixel * pixel)
     }
 
-    /// The four pixels around a point with their weights, block by block.
+    /// The four pixels around a point, block by block.
+    #[inline]
     fn corners(&self, p: Vec2) -> ArrayVec<Corner, 4> {
         let u = (p + 1.0) / self.geometry.pixel() - 0.5;
-        let first = u.floor();
-        let f = u - first;
-        let mut corners: ArrayVec<Corner, 4> = ArrayVec::new();
-        for (dy, wy) in [(0, 1.0 - f.y), (1, f.y)] {
-            for (dx, wx) in [(0, 1.0 - f.x), (1, f.x)] {
-                let (column, row) = (first.x as i32 + dx, first.y as i32 + dy);
-                let inside = 0..self.geometry.resolution as i32;
-                if !inside.contains(&column) || !inside.contains(&row) || wx * wy <= 0.0 {
-                    continue;
-                }
-                let (column, row) = (column as usize, row as usize);
-                let block = row / BLOCK * self.geometry.blocks() as usize + column / BLOCK;
-                let pixel = (row % BLOCK, column % BLOCK, wx * wy);
-                match corners.iter_mut().find(|(b, _)| *b == block as u32) {
-                    Some((_, pixels)) => pixels.push(pixel),
-                    None => corners.push((block as u32, std::iter::once(pixel).collect())),
-                }
+        let columns = self.lines(u.x);
+        let rows = self.lines(u.y);
+        let mut corners = ArrayVec::new();
+        for rows in &rows {
+            for columns in &columns {
+                corners.push(Corner {
+                    block: rows.block * self.geometry.blocks() + columns.block,
+                    rows: *rows,
+                    columns: *columns,
+                });
             }
         }
         corners
+    }
+
+    /// The two pixels around a coordinate, block by block.
+    #[inline]
+    fn lines(&self, u: f32) -> ArrayVec<Line, 2> {
+        let first = u.floor();
+        let fraction = u - first;
+        let inside = 0..self.geometry.resolution as i32;
+        let mut lines: ArrayVec<Line, 2> = ArrayVec::new();
+        for (i, weight) in [(first as i32, 1.0 - fraction), (first as i32 + 1, fraction)] {
+            if !inside.contains(&i) || weight <= 0.0 {
+                continue;
+            }
+            let (block, i) = (i as u32 / BLOCK as u32, i as usize % BLOCK);
+            match lines.last_mut() {
+                Some(line) if line.block == block => {
+                    line.weights[1] = weight;
+                    line.count = 2;
+                }
+                _ => lines.push(Line {
+                    block,
+                    first: i,
+                    count: 1,
+                    weights: [weight, 0.0],
+                }),
+            }
+        }
+        lines
     }
 
     /// The group of an image's block and the block's row in it.
@@ -352,71 +434,6 @@ impl Images {
     #[inline]
     fn mask(&self, group: usize) -> &[u64] {
         &self.parts.masks[group * self.members.words..][..self.members.words]
-    }
-
-    /// `C_r Y_r(i) X_r(j)` for pixels (i, j).
-    #[inline]
-    fn products(&self, group: &Group, pixels: &ArrayVec<(usize, usize, f32), 4>) -> Products<4> {
-        let rank = group.rank as usize;
-        let mut products = Products {
-            values: [[f32x8::ZERO; CHUNKS]; 4],
-            chunks: rank.div_ceil(8),
-        };
-        for chunk in 0..products.chunks {
-            let scale = self.scale(group, chunk);
-            for (k, &(row, column, _)) in pixels.iter().enumerate() {
-                let y = self.factor(group, 0, row, chunk);
-                let x = self.factor(group, 1, column, chunk);
-                products.values[k][chunk] = scale * y * x;
-            }
-        }
-        products
-    }
-
-    /// Eight of `C_r`; beyond the rank zero, so that no other factor has to end there.
-    #[inline]
-    fn scale(&self, group: &Group, chunk: usize) -> f32x8 {
-        let first = group.scales as usize + 8 * chunk;
-        let mut scale: [f32; 8] = self.parts.scales[first..first + 8].try_into().unwrap_or_default();
-        let rest = (group.rank as usize).saturating_sub(8 * chunk);
-        if rest < 8 {
-            scale[rest..].fill(0.0);
-        }
-        f32x8::from(scale)
-    }
-
-    /// Eight components of `Y(i)` (axis 0) or `X(i)` (axis 1).
-    #[inline]
-    fn factor(&self, group: &Group, axis: usize, i: usize, chunk: usize) -> f32x8 {
-        self.prefix(group, axis, i + 1, chunk) - self.prefix(group, axis, i, chunk)
-    }
-
-    /// Eight components of the sum of the first `i` of `Y` or `X`.
-    #[inline]
-    fn prefix(&self, group: &Group, axis: usize, i: usize, chunk: usize) -> f32x8 {
-        match i {
-            0 => f32x8::ZERO,
-            i => self.eight(group, axis * BLOCK + i - 1, chunk),
-        }
-    }
-
-    #[inline]
-    fn eight(&self, group: &Group, line: usize, chunk: usize) -> f32x8 {
-        let first = group.factors as usize + line * group.rank as usize + 8 * chunk;
-        let values: [i16; 8] = self.parts.factors[first..first + 8]
-            .try_into()
-            .unwrap_or_default();
-        f32x8::from_i32x8(i32x8::from_i16x8(i16x8::from(values)))
-    }
-
-    /// A row of Z.
-    #[inline]
-    fn row(&self, group: &Group, row: usize) -> [f32x8; CHUNKS] {
-        let mut z = [f32x8::ZERO; CHUNKS];
-        for (chunk, z) in z.iter_mut().enumerate().take((group.rank as usize).div_ceil(8)) {
-            *z = self.eight(group, 2 * BLOCK + row, chunk);
-        }
-        z
     }
 
     // ---- range queries --------------------------------------------------------------------------------------------------------
@@ -448,40 +465,25 @@ impl Images {
     }
 
     fn sum_block(&self, blend: &Blend, block: u32, rows: &Interval, columns: &Interval) -> f64 {
+        const C: usize = MAX_RANK / 8;
+        let arrays = Arrays::new(&self.parts);
         let mut sum = 0.0;
-        let mut known: Option<(usize, Products<1>)> = None;
+        let mut known = usize::MAX;
+        let mut products = [f32x8::ZERO; C];
         for &(image, weight) in blend {
             let Some((index, row)) = self.find(image, block) else {
                 continue;
             };
             let group = &self.groups[index];
-            if known.as_ref().is_none_or(|(i, _)| *i != index) {
-                let mut products = Products {
-                    values: [[f32x8::ZERO; CHUNKS]],
-                    chunks: (group.rank as usize).div_ceil(8),
-                };
-                for chunk in 0..products.chunks {
-                    products.values[0][chunk] = self.scale(group, chunk)
-                        * self.sum(group, 0, rows, chunk)
-                        * self.sum(group, 1, columns, chunk);
-                }
-                known = Some((index, products));
+            if known != index {
+                known = index;
+                let scales: Components<C> = arrays.scales(group);
+                let y: Components<C> = arrays.sum(group, 0, rows);
+                let x: Components<C> = arrays.sum(group, 1, columns);
+                products = std::array::from_fn(|c| scales[c] * y[c] * x[c]);
             }
-            if let Some((_, products)) = &known {
-                let share = products.dot(0, &self.row(group, row)) * self.inv_totals[image as usize];
-                sum += f64::from(weight * share);
-            }
-        }
-        sum
-    }
-
-    /// Eight components of the weighted sum of `Y` or `X` over an interval: two look-ups, and what is cut at the ends.
-    #[inline]
-    fn sum(&self, group: &Group, axis: usize, interval: &Interval, chunk: usize) -> f32x8 {
-        let Range { start, end } = interval.whole;
-        let mut sum = self.prefix(group, axis, end, chunk) - self.prefix(group, axis, start, chunk);
-        for &(i, weight) in &interval.parts {
-            sum += self.factor(group, axis, i, chunk) * f32x8::splat(weight);
+            let share = dot(&products, &arrays.line(group, 2 * BLOCK + row)) * self.inv_total(image);
+            sum += f64::from(weight * share);
         }
         sum
     }
@@ -554,27 +556,34 @@ impl Images {
 
     /// What counts of all pixels of a block.
     pub fn reconstruct(&self, group: &Group, row: usize, pixels: &mut [f32; PIXELS]) {
-        let rank = group.rank as usize;
-        let z = self.row(group, row);
+        match self.chunks {
+            1 => self.reconstruct_components::<1>(group, row, pixels),
+            2 => self.reconstruct_components::<2>(group, row, pixels),
+            4 => self.reconstruct_components::<4>(group, row, pixels),
+            _ => self.reconstruct_components::<8>(group, row, pixels),
+        }
+    }
+
+    fn reconstruct_components<const C: usize>(&self, group: &Group, row: usize, pixels: &mut [f32; PIXELS]) {
+        let arrays = Arrays::new(&self.parts);
+        let scales: Components<C> = arrays.scales(group);
+        let z: Components<C> = arrays.line(group, 2 * BLOCK + row);
         // Columns of one component side by side.
-        let mut x = [[0.0_f32; BLOCK]; MAX_RANK];
+        let mut x = [[[0.0_f32; BLOCK]; 8]; C];
         for column in 0..BLOCK {
-            for chunk in 0..rank.div_ceil(8) {
-                let values = self.factor(group, 1, column, chunk).to_array();
-                for (k, value) in values.into_iter().enumerate() {
-                    x[8 * chunk + k][column] = value;
+            let values: Components<C> = arrays.factor(group, 1, column);
+            for (x, values) in x.iter_mut().zip(values) {
+                for (x, value) in x.iter_mut().zip(values.to_array()) {
+                    x[column] = value;
                 }
             }
         }
-        let mut scales = [f32x8::ZERO; CHUNKS];
-        for (chunk, scale) in scales.iter_mut().enumerate().take(rank.div_ceil(8)) {
-            *scale = self.scale(group, chunk) * z[chunk];
-        }
         for (row, pixels) in pixels.chunks_exact_mut(BLOCK).enumerate() {
+            let y: Components<C> = arrays.factor(group, 0, row);
             let mut sums = [f32x8::ZERO; 2];
-            for (chunk, scale) in scales.iter().enumerate().take(rank.div_ceil(8)) {
-                let y = (*scale * self.factor(group, 0, row, chunk)).to_array();
-                for (y, x) in y.into_iter().zip(&x[8 * chunk..]) {
+            for c in 0..C {
+                let y = (scales[c] * z[c] * y[c]).to_array();
+                for (y, x) in y.into_iter().zip(&x[c]) {
                     let half = |h: usize| f32x8::from(std::array::from_fn(|k| x[8 * h + k]));
                     sums[0] += f32x8::splat(y) * half(0);
                     sums[1] += f32x8::splat(y) * half(1);
@@ -702,13 +711,108 @@ impl Interval {
     }
 }
 
-impl<const N: usize> Products<N> {
-    #[inline]
-    fn dot(&self, pixel: usize, z: &[f32x8; CHUNKS]) -> f32 {
-        let mut sum = f32x8::ZERO;
-        for chunk in 0..self.chunks {
-            sum += self.values[pixel][chunk] * z[chunk];
-        }
-        sum.reduce_add()
+#[inline]
+fn dot<const C: usize>(a: &Components<C>, b: &Components<C>) -> f32 {
+    let mut sum = f32x8::ZERO;
+    for c in 0..C {
+        sum += a[c] * b[c];
     }
+    sum.reduce_add()
+}
+
+/// The arrays that queries read. Where a file is mapped, every look at an array checks its alignment: once a query is enough.
+#[derive(Clone, Copy)]
+struct Arrays<'a> {
+    factors: &'a [i16],
+    scales: &'a [f32],
+}
+
+impl<'a> Arrays<'a> {
+    #[inline]
+    fn new(parts: &'a Parts) -> Self {
+        Self {
+            factors: &parts.factors,
+            scales: &parts.scales,
+        }
+    }
+
+    /// `C_r`; beyond the rank zero, so that no other factor has to end there.
+    #[inline]
+    fn scales<const C: usize>(&self, group: &Group) -> Components<C> {
+        let values = &self.scales[group.scales as usize..][..8 * C];
+        let rank = group.rank as usize;
+        std::array::from_fn(|c| {
+            f32x8::from(std::array::from_fn(|k| {
+                let r = 8 * c + k;
+                if r < rank { values[r] } else { 0.0 }
+            }))
+        })
+    }
+
+    /// Line `line` of a group's factors, as integers.
+    #[inline]
+    fn integers<const C: usize>(&self, group: &Group, line: usize) -> [i16x8; C] {
+        let first = group.factors as usize + line * group.rank as usize;
+        let values = &self.factors[first..][..8 * C];
+        std::array::from_fn(|c| i16x8::from(std::array::from_fn(|k| values[8 * c + k])))
+    }
+
+    /// The same as numbers.
+    #[inline]
+    fn line<const C: usize>(&self, group: &Group, line: usize) -> Components<C> {
+        self.integers(group, line).map(number)
+    }
+
+    /// The sum of the first `i` of `Y` (axis 0) or `X` (axis 1).
+    #[inline]
+    fn prefix<const C: usize>(&self, group: &Group, axis: usize, i: usize) -> [i16x8; C] {
+        match i {
+            0 => [i16x8::ZERO; C],
+            i => self.integers(group, axis * BLOCK + i - 1),
+        }
+    }
+
+    /// `Y(i)` or `X(i)`.
+    #[inline]
+    fn factor<const C: usize>(&self, group: &Group, axis: usize, i: usize) -> Components<C> {
+        let (below, above): ([_; C], [_; C]) = (self.prefix(group, axis, i), self.prefix(group, axis, i + 1));
+        std::array::from_fn(|c| number(above[c] - below[c]))
+    }
+
+    /// `C_r Y_r(i) X_r(j)` for the pixels of a corner: two rows of two columns.
+    #[inline]
+    fn multiply<const C: usize>(&self, group: &Group, corner: &Corner, products: &mut [Components<C>; 4]) {
+        let scales: Components<C> = self.scales(group);
+        let mut x = [[f32x8::ZERO; C]; 2];
+        for (j, x) in x.iter_mut().enumerate().take(corner.columns.count) {
+            *x = self.factor(group, 1, corner.columns.first + j);
+        }
+        for i in 0..corner.rows.count {
+            let y: Components<C> = self.factor(group, 0, corner.rows.first + i);
+            for j in 0..2 {
+                products[2 * i + j] = std::array::from_fn(|c| scales[c] * y[c] * x[j][c]);
+            }
+        }
+    }
+
+    /// The weighted sum of `Y` or `X` over an interval: two look-ups, and what is cut at the ends.
+    #[inline]
+    fn sum<const C: usize>(&self, group: &Group, axis: usize, interval: &Interval) -> Components<C> {
+        let Range { start, end } = interval.whole;
+        let (below, above): ([_; C], [_; C]) =
+            (self.prefix(group, axis, start), self.prefix(group, axis, end));
+        let mut sum: Components<C> = std::array::from_fn(|c| number(above[c]) - number(below[c]));
+        for &(i, weight) in &interval.parts {
+            let factor: Components<C> = self.factor(group, axis, i);
+            for c in 0..C {
+                sum[c] += factor[c] * f32x8::splat(weight);
+            }
+        }
+        sum
+    }
+}
+
+#[inline]
+fn number(integers: i16x8) -> f32x8 {
+    f32x8::from_i32x8(i32x8::from_i16x8(integers))
 }
