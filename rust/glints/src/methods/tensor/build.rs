@@ -413,7 +413,9 @@ fn assemble(geometry: Geometry, groups: Vec<Compressed>) -> Images {
         masks.extend(mask);
         factors.extend(group.prefixes);
         factors.extend(&group.rows[..kept * group.rank]);
+        let end = scales.len() + super::images::scales(group.rank);
         scales.extend(group.scales);
+        scales.resize(end, 0.0);
     }
     factors.extend([0; PADDING]);
     scales.extend([0.0; PADDING]);

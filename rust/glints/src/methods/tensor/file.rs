@@ -366,7 +366,11 @@ fn check_parts(geometry: &Geometry, parts: &Parts) -> Checked<()> {
         let fits = |first: u32, count: usize, length: usize| first as usize + count + PADDING <= length;
         demand(
             fits(group.factors, elements, parts.factors.len())
-                && fits(group.scales, group.rank as usize, parts.scales.len()),
+                && fits(
+                    group.scales,
+                    super::images::scales(group.rank.into()),
+                    parts.scales.len(),
+                ),
             "a group's place",
         )?;
     }

@@ -47,6 +47,11 @@ pub const LARGEST_ROW: f32 = 32_767.0;
 /// Elements after the last one of an array whose components are read as if there were [`MAX_RANK`].
 pub const PADDING: usize = MAX_RANK;
 
+/// Scales of a group of a rank.
+pub fn scales(rank: usize) -> usize {
+    rank.next_multiple_of(8)
+}
+
 /// Elements of a group of a rank with so many rows.
 pub fn elements(rank: usize, rows: usize) -> usize {
     (2 * BLOCK + rows) * rank
@@ -100,7 +105,7 @@ pub struct Parts {
     pub masks: Array<u64>,
     /// Prefix sums and rows, with padding.
     pub factors: Array<i16>,
-    /// `C_r`, with padding.
+    /// `C_r`, zero up to the next multiple of eight, with padding.
     pub scales: Array<f32>,
     /// Shares of each image's blocks, image by image, blocks in order.
     pub masses: Array<u16>,
@@ -736,16 +741,15 @@ impl<'a> Arrays<'a> {
         }
     }
 
-    /// `C_r`; beyond the rank zero, so that no other factor has to end there.
+    /// `C_r`; beyond the rank zero, as stored or here, so that no other factor has to end there.
     #[inline]
     fn scales<const C: usize>(&self, group: &Group) -> Components<C> {
         let values = &self.scales[group.scales as usize..][..8 * C];
-        let rank = group.rank as usize;
         std::array::from_fn(|c| {
-            f32x8::from(std::array::from_fn(|k| {
-                let r = 8 * c + k;
-                if r < rank { values[r] } else { 0.0 }
-            }))
+            if 8 * c >= group.rank as usize {
+                return f32x8::ZERO;
+            }
+            f32x8::from(std::array::from_fn(|k| values[8 * c + k]))
         })
     }
 
