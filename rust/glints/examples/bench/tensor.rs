@@ -5,7 +5,7 @@
 //! * `tensor/storage` bytes of the compressed images with their summed-area tables; `tensor/exact_storage` those of the structure
 //!   that answers for small footprints.
 //! * `tensor/ndf_error` relative L1 errors of distributions: of the finest level's images against the uncompressed pyramid
-//!   (`against` = `pyramid`; `params` has the mean squared error and all levels), and over footprints on the map against the direct sum
+//!   (`against` = `pyramid`; `params` has the mean squared error of a pixel), and over footprints on the map against the direct sum
 //!   under a Gaussian (`direct`).
 //! * `tensor/eval`, `tensor/sample` processor time of a query, against one of a plain Beckmann microfacet BRDF;
 //!   `tensor/eval/growth` the worst over the first, of all footprints, from 61 texels to 1000 periods of the map.
@@ -104,10 +104,6 @@ fn precompute(map: &NormalMap, model: FlakeModel, options: &Options, params: &Va
         &[
             ("against", json!("pyramid")),
             ("mse", json!(report.errors[0].1)),
-            (
-                "levels",
-                json!(report.errors.iter().map(|e| e.0).collect::<Vec<_>>()),
-            ),
             ("relative_l2", json!(report.relative_error)),
         ],
     );
@@ -122,7 +118,7 @@ fn precompute(map: &NormalMap, model: FlakeModel, options: &Options, params: &Va
     Ok(tensor)
 }
 
-/// Minutes and megabytes of the paper's map and rank; its machine has 40 cores. NaN where it has none.
+/// Minutes and megabytes of the paper's map and rank; its machine has 40 cores. NaN, null in a row, where it has none.
 fn published(params: &Value) -> (f64, f64) {
     let map = params["map"].as_str().unwrap_or_default();
     match (map, params["side"].as_u64(), params["rank"].as_u64()) {
