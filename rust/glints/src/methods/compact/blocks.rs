@@ -24,13 +24,13 @@
 use rayon::prelude::*;
 use wide::{CmpGe, f32x8, u32x8};
 
-use super::array::Array;
 use super::border::{Touched, Weight};
 use super::cover::Rect;
 use super::grid::Grid;
 use super::lanes::{LANES, lane_mask};
 use super::lobes::{Near, Sums};
 use super::packing::{GROUP, Packed, pack, prefetch, to_float, units_per_group};
+use crate::array::Array;
 use crate::normal_map::NormalMap;
 
 /// One in so many elements of the permutation has a pointer.

@@ -20,12 +20,12 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use wide::{CmpLe, f32x8};
 
-use super::array::Array;
 use super::cover::{Node, Tree};
 use super::grid::Grid;
 use super::lanes::LANES;
 use super::lobes::{Lobe, Normals, Sums};
 use super::packing::{prefetch, to_float, widened};
+use crate::array::Array;
 
 /// Width of a bin in standard deviations of a lobe, `alpha / sqrt 2`; the paper has 1.2 (Eq. 16 of Atanasov et al. 2021).
 /// Wider ones show through the lobes that are left.

@@ -50,7 +50,6 @@ use bytemuck::Pod;
 use glam::Vec2;
 use memmap2::Mmap;
 
-use super::array::Array;
 use super::blocks::{Blocks, Geometry, Offsets, Parts};
 use super::check;
 use super::counts::{self, Counts, Level};
@@ -58,6 +57,7 @@ use super::cover::Tree;
 use super::grid::Grid;
 use super::tiles::Tiles;
 use super::{CompactBinMap, LEAF_BITS, Texels};
+use crate::array::Array;
 use crate::error::{Error, Result};
 use crate::flakes::{FlakeModel, Normalization};
 use crate::microfacet::{Distribution, Flake};

@@ -51,7 +51,6 @@
 //! **Files** A structure is saved with [`CompactBinMap::save`] and used in place after [`CompactBinMap::load`]; the format
 //! stands at the top of the module `file`.
 
-mod array;
 mod blocks;
 mod border;
 mod check;

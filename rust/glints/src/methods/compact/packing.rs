@@ -6,7 +6,7 @@
 
 use wide::{f32x8, u32x8};
 
-use super::array::Array;
+use crate::array::Array;
 
 /// Words in a group.
 pub const GROUP: usize = 8;

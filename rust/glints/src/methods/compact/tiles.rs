@@ -14,13 +14,13 @@ use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 use wide::{f32x8, u8x16, u32x8};
 
-use super::array::Array;
 use super::border::{Border, Touched, Weight};
 use super::cover::Rect;
 use super::grid::Grid;
 use super::lanes::{LANES, order};
 use super::lobes::{Near, Sums};
 use super::packing::{prefetch, to_float, widened};
+use crate::array::Array;
 use crate::normal_map::NormalMap;
 
 /// Columns and rows of a tile.
