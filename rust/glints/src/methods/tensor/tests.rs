@@ -14,7 +14,7 @@ pub fn model() -> FlakeModel {
 
 /// A number in [0, 1) for each index.
 pub fn random(index: usize, which: u64) -> f32 {
-    (mix(index as u64 * 0x9e37_79b9_7f4a_7c15 ^ which << 50) >> 40) as f32 / 16_777_216.0
+    (mix((index as u64 * 0x9e37_79b9_7f4a_7c15) ^ (which << 50)) >> 40) as f32 / 16_777_216.0
 }
 
 /// Waves with noise.
@@ -223,7 +223,7 @@ fn the_histogram_of_samples_is_the_distribution() {
     let count = samples();
     for footprint in [footprint(60.0), footprint(7.5), elongated] {
         let density = |p: Vec2| tensor.ndf(&footprint, half(p));
-        let result = chi_square(&tensor, &footprint, count, density);
+        let result = chi_square(tensor, &footprint, count, density);
         assert!(agrees(result), "{result:?}");
     }
 }
@@ -241,7 +241,7 @@ fn a_wrong_density_is_found() {
     let blend = tensor.select(&footprint).images;
     let count = samples();
     let right = |p: Vec2| images.density(&blend, p);
-    assert!(agrees(chi_square(&tensor, &footprint, count, right)));
+    assert!(agrees(chi_square(tensor, &footprint, count, right)));
 
     // Too much by a twentieth in one half of the disk, too little in the other.
     let wrong_pdf = |p: Vec2| images.density(&blend, p) * if p.x > 0.0 { 1.05 } else { 0.95 };
@@ -252,7 +252,7 @@ fn a_wrong_density_is_found() {
     let pixel = images.geometry.pixel();
     let uninterpolated = |p: Vec2| images.density(&blend, ((p / pixel).floor() + 0.5) * pixel);
     for wrong in [&wrong_pdf as &dyn Fn(Vec2) -> f32, &wrong_level, &uninterpolated] {
-        assert!(!agrees(chi_square(&tensor, &footprint, count, wrong)));
+        assert!(!agrees(chi_square(tensor, &footprint, count, wrong)));
     }
 }
 
@@ -301,7 +301,7 @@ fn what_is_loaded_answers_as_what_was_saved() {
     let (map, tensor) = small();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.glints");
-    tensor.save(&map, &path).unwrap();
+    tensor.save(map, &path).unwrap();
     assert!(is_saved(&path));
     let (loaded, loaded_map) = Tensor::load(&path).unwrap();
     assert_eq!(loaded.bytes(), tensor.bytes());
