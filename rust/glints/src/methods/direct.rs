@@ -138,7 +138,9 @@ impl Method for Direct {
     fn ndf_over(&self, footprint: &Footprint, low: Vec2, high: Vec2) -> Option<f32> {
         Some(mean_over(low, high, || {
             let mut sum = 0.0;
-            self.for_each_texel(footprint, |t, weight| sum += self.model.ndf_integral(t, weight, low, high));
+            self.for_each_texel(footprint, |t, weight| {
+                sum += self.model.ndf_integral(t, weight, low, high)
+            });
             sum
         }))
     }

@@ -43,22 +43,17 @@ pub fn select(geometry: &Geometry, footprint: &Footprint, deviation: f64) -> Sel
     let finest = effective(geometry);
     let taps = Taps::new(&GaussianFootprint::new(footprint, deviation));
     let exact = ((finest - taps.sigma) / (0.5 * finest)).clamp(0.0, 1.0) as f32;
-    let mut images = Blend::new();
-    if exact < 1.0 {
-        let last = (geometry.levels.len() - 1) as f64;
-        let position = (taps.sigma / finest).log2().clamp(0.0, last);
-        let (level, fraction) = (position.floor(), position - position.floor());
-        let weight = 1.0 / taps.offsets.len() as f64;
-        for (index, share) in [(level, 1.0 - fraction), (level + 1.0, fraction)] {
-            if share > 0.0 {
-                let level = &geometry.levels[index as usize];
-                for offset in &taps.offsets {
-                    add_nodes(level, footprint.center() + *offset, weight * share, &mut images);
-                }
-            }
-        }
-    }
+    let images = if exact < 1.0 {
+        taps.blend(geometry, footprint.center())
+    } else {
+        Blend::new()
+    };
     Selection { images, exact }
+}
+
+/// The images alone: a footprint below the finest level's gets that level's.
+pub fn images(geometry: &Geometry, footprint: &Footprint, deviation: f64) -> Blend {
+    Taps::new(&GaussianFootprint::new(footprint, deviation)).blend(geometry, footprint.center())
 }
 
 fn add_nodes(level: &Level, position: DVec2, share: f64, images: &mut Blend) {
@@ -84,6 +79,24 @@ struct Taps {
 }
 
 impl Taps {
+    /// The images of the taps about `center`, of the two levels about their size; weights sum to one.
+    fn blend(&self, geometry: &Geometry, center: DVec2) -> Blend {
+        let last = (geometry.levels.len() - 1) as f64;
+        let position = (self.sigma / effective(geometry)).log2().clamp(0.0, last);
+        let (level, fraction) = (position.floor(), position - position.floor());
+        let weight = 1.0 / self.offsets.len() as f64;
+        let mut images = Blend::new();
+        for (index, share) in [(level, 1.0 - fraction), (level + 1.0, fraction)] {
+            if share > 0.0 {
+                let level = &geometry.levels[index as usize];
+                for offset in &self.offsets {
+                    add_nodes(level, center + *offset, weight * share, &mut images);
+                }
+            }
+        }
+        images
+    }
+
     fn new(gaussian: &GaussianFootprint) -> Self {
         let q = gaussian.covariance(0.0);
         let (mean, difference) = (0.5 * (q.xx + q.yy), 0.5 * (q.xx - q.yy));

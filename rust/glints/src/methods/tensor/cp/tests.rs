@@ -177,13 +177,13 @@ fn reference(tensor: &Tensor, rank: usize, seed: u64, sweeps: usize) -> f64 {
 fn eliminate(mut matrix: Vec<Vec<f64>>, mut right: Vec<f64>) -> Vec<f64> {
     let n = right.len();
     for column in 0..n {
-        let pivot_row = matrix[column].clone();
-        for row in column + 1..n {
-            let scale = matrix[row][column] / pivot_row[column];
-            for (element, pivot) in matrix[row].iter_mut().zip(&pivot_row) {
+        let (pivot_row, known) = (matrix[column].clone(), right[column]);
+        for (row, value) in matrix.iter_mut().zip(&mut right).skip(column + 1) {
+            let scale = row[column] / pivot_row[column];
+            for (element, pivot) in row.iter_mut().zip(&pivot_row) {
                 *element -= scale * pivot;
             }
-            right[row] -= scale * right[column];
+            *value -= scale * known;
         }
     }
     for row in (0..n).rev() {
