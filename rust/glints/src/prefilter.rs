@@ -457,7 +457,7 @@ mod tests {
         let environment = environment(|x| 0.1 + (4.0 * x.x + 3.0 * x.z).exp(), 12);
         let wi = Vec3::new(-0.4, 0.1, 1.0).normalize();
         let (brdf, prefilter) = &surface;
-        let mut chosen = vec![0.0; 12];
+        let mut chosen = [0.0; 12];
         let probabilities = prefilter
             .probabilities(wi, &Mat3::IDENTITY, &environment)
             .unwrap();

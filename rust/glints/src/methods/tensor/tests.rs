@@ -270,7 +270,7 @@ fn a_wrong_density_is_found() {
     let pixel = images.geometry.pixel();
     let uninterpolated = |p: Vec2| images.density(&blend, ((p / pixel).floor() + 0.5) * pixel);
     for wrong in [&wrong_pdf as &dyn Fn(Vec2) -> f32, &wrong_level, &uninterpolated] {
-        let result = chi_square(&tensor, &footprint, count, wrong);
+        let result = chi_square(tensor, &footprint, count, wrong);
         assert!(!agrees(result), "{result:?}");
     }
 }
