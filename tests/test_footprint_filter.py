@@ -49,9 +49,10 @@ def test_axis_aligned_footprints_have_products_of_error_functions(make_map, sigm
     assert support.value(box, si, wo) != pytest.approx(expected, rel=3e-3)
 
 
+@pytest.mark.parametrize("plugin", ["glints_direct", "glints_ibm"])
 @pytest.mark.parametrize("footprint", ["subtexel", "texels"])
-def test_samples_have_the_density_of_pdf(flakes_map, footprint):
-    gaussian = support.bsdf("glints_direct", flakes_map, alpha=0.1, **GAUSSIAN)
+def test_samples_have_the_density_of_pdf(flakes_map, footprint, plugin):
+    gaussian = support.bsdf(plugin, flakes_map, alpha=0.1, **GAUSSIAN)
     si, bins = vertex(footprint, "oblique"), 24
     probabilities = integrate_cells(si, bins, lambda wo: gaussian.pdf(CONTEXT, si, mi.Vector3f(*wo)))
     probabilities = np.append(probabilities, max(0.0, 1 - probabilities.sum()))
@@ -59,9 +60,25 @@ def test_samples_have_the_density_of_pdf(flakes_map, footprint):
     assert chi_square(counts, probabilities) > 1e-4 / 2
     if footprint == "texels":
         # The broken twin: texels drawn with the box's weights.
-        box = support.bsdf("glints_direct", flakes_map, alpha=0.1)
+        box = support.bsdf(plugin, flakes_map, alpha=0.1)
         others, _ = draw_cells(box, si, bins, 10_000, np.random.default_rng(1))
         assert chi_square(others, probabilities) < 1e-12
+
+
+def test_the_compact_structure_has_the_gaussian_of_the_direct_sum(flakes_map):
+    si = vertex("texels", "oblique")
+    wos = [support.unit((0.1 * x - 0.3, 0.1 * y - 0.3, 1)) for x, y in itertools.product(range(7), range(7))]
+    values = {}
+    for plugin, sigma in itertools.product(("glints_direct", "glints_ibm"), (0.5, 0.2)):
+        gaussian = support.bsdf(plugin, flakes_map, alpha=0.1, footprint_sigma=sigma, **GAUSSIAN)
+        values[plugin, sigma] = np.array([support.value(gaussian, si, wo) for wo in wos])
+
+    def distance(a, b):
+        return np.abs(values[a] - values[b]).sum() / values[b].sum()
+
+    for sigma in (0.5, 0.2):
+        assert distance(("glints_ibm", sigma), ("glints_direct", sigma)) < 0.03
+    assert distance(("glints_ibm", 0.2), ("glints_direct", 0.5)) > 0.1
 
 
 def test_the_box_is_the_default(flakes_map):
@@ -82,8 +99,10 @@ def test_the_box_is_the_default(flakes_map):
         ("glints_direct", {"footprint_sigma": 0.3}, ["footprint_sigma", 'footprint_filter="gaussian"']),
         ("glints_direct", {"footprint_sigma": 5.0, **GAUSSIAN}, ["footprint_sigma", "[0.05, 4]"]),
         ("glints_direct", {"footprint_sigma": float("nan"), **GAUSSIAN}, ["footprint_sigma", "[0.05, 4]"]),
-        ("glints_ibm", GAUSSIAN, ["footprint_filter", "equal weight", "glints_direct"]),
         ("glints_ibm", {"structure": "paper", **GAUSSIAN}, ["footprint_filter", "equal weight", "glints_direct"]),
+        ("glints_ibm", {"bins": 63, **GAUSSIAN}, ["footprint_filter", "equal weight", "compact"]),
+        ("glints_ibm", {"alpha": 0.0, "bins": 63, **GAUSSIAN}, ["footprint_filter", "equal weight", "glints_direct"]),
+        ("glints_ibm", {"footprint_sigma": 5.0, **GAUSSIAN}, ["footprint_sigma", "[0.05, 4]"]),
         ("glints_unfiltered", GAUSSIAN, ["footprint_filter"]),
         ("glints_unfiltered", {"footprint_sigma": 0.5}, ["footprint_sigma"]),
         ("glints_yan16", GAUSSIAN, ["footprint_filter"]),

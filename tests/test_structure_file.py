@@ -63,6 +63,15 @@ def test_images_are_those_of_the_built_structure_bit_for_bit(folder, name, param
     assert not np.array_equal(image(other), image(built))
 
 
+def test_a_file_can_be_seen_through_a_gaussian(folder):
+    gaussian = {"footprint_filter": "gaussian", "footprint_sigma": 0.4}
+    built = support.bsdf("glints_ibm", folder / "map.exr", **ROUGH, **gaussian)
+    loaded = load(folder, "rough.glints", filename=str(folder / "map.exr"), **gaussian)
+    assert np.array_equal(image(loaded), image(built))
+    # The twin: the box.
+    assert not np.array_equal(image(load(folder, "rough.glints", filename=str(folder / "map.exr"))), image(built))
+
+
 @pytest.mark.parametrize("name, parameters", CASES[:2])
 def test_one_file_is_enough(folder, name, parameters):
     """Without any masking bit for bit; the map's is made of the slopes in the file, which are quantised."""

@@ -240,13 +240,15 @@ SavedStructure SavedStructure::read(const std::string &structure_file) {
     });
 }
 
-Brdf Brdf::load_inverse_bin_map(const std::string &structure_file, const SurfaceOptions &surface,
-                                const NormalMap *map) {
+Brdf Brdf::load_inverse_bin_map(const std::string &structure_file, const SurfaceOptions &surface, const NormalMap *map,
+                                const FilterOptions &filter) {
     return translated([&] {
         rust::Str file = utf8(structure_file, "structure_file");
         bridge::Surface given = to_bridge(surface);
-        return Brdf(std::make_unique<Impl>(Impl{map ? bridge::load_inverse_bin_map_of(*map->m_impl->map, file, given)
-                                                    : bridge::load_inverse_bin_map(file, given)}));
+        bridge::FilterOptions seen = to_bridge(filter);
+        return Brdf(
+            std::make_unique<Impl>(Impl{map ? bridge::load_inverse_bin_map_of(*map->m_impl->map, file, given, seen)
+                                            : bridge::load_inverse_bin_map(file, given, seen)}));
     });
 }
 

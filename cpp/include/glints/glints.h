@@ -119,7 +119,7 @@ enum class FootprintFilter : uint8_t {
     Gaussian, ///< by a Gaussian whose axes are the parallelogram's edges, cut at 3.74 standard deviations
 };
 
-/// The filter of the direct sum; inverse bin maps answer for the box alone.
+/// The filter of the direct sum and of the compact inverse bin map; the paper's answers for the box alone.
 struct GLINTS_API FilterOptions {
     FootprintFilter filter = FootprintFilter::Box;
     /// Standard deviation of the Gaussian in pixels (edges of the footprint), in [0.05, 4]: 0.5 is that of Yan et al.'s
@@ -269,7 +269,7 @@ struct LobeSample {
 class GLINTS_API Brdf {
 public:
     /// Inverse bin map, Atanasov et al. 2021 (Sections 5.2-5.4); with `surface.alpha = 0` that of their talk of 2020,
-    /// which needs `options.bins`. A Gaussian `filter` is refused.
+    /// which needs `options.bins`. The paper's structure refuses a Gaussian `filter`.
     static Brdf inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface,
                                 const InverseBinMapOptions &options = {},
                                 const InterpolationOptions &interpolation = {}, const FilterOptions &filter = {});
@@ -279,7 +279,7 @@ public:
     /// Beckmann` is made of its slopes instead of those in the file, which are quantised (and of an interpolated map, those
     /// of the refined one).
     static Brdf load_inverse_bin_map(const std::string &structure_file, const SurfaceOptions &surface,
-                                     const NormalMap *map = nullptr);
+                                     const NormalMap *map = nullptr, const FilterOptions &filter = {});
     /// The exact sum over every texel of the footprint (Eq. 11).
     static Brdf direct(const NormalMap &map, const SurfaceOptions &surface,
                        const InterpolationOptions &interpolation = {}, const FilterOptions &filter = {});

@@ -70,8 +70,11 @@ Parameters of this plugin
 |             |         | at which normals of neighbours are at most 1.5 standard deviations of a flake's lobe apart   |
 |             |         | (`alpha` / sqrt(2), root mean square), as far as 8 and 8192 x 8192 texels in all go; a warn- |
 |             |         | ing tells where that is too few. Required with `alpha` = 0. (Default: 0)                     |
-| `footprint_ | string  | How the pixel weights what it covers: `box`, evenly. A `gaussian`, as `glints_direct` has    |
-| filter`     |         | it, is refused: the structures count texels of equal weight. (Default: `box`)                |
+| `footprint_ | string  | How the pixel weights what it covers: `box`, evenly, or `gaussian`, as for `glints_direct`.   |
+| filter`     |         | Only the compact structure has the Gaussian, built or from `structure_file`: the paper's     |
+|             |         | counts texels of equal weight. (Default: `box`)                                              |
+| `footprint_ | float   | Standard deviation of the Gaussian in pixels, in [0.05, 4], as for `glints_direct`.          |
+| sigma`      |         | (Default: 0.5)                                                                               |
 
 Guidance
 --------
@@ -170,9 +173,6 @@ static glints::Brdf load_brdf(const mitsuba::Properties &props, const glints::No
     if (props.has_property("structure") && glints_mitsuba::choice_parameter(props, "structure", {"compact", "paper"}))
         glints_mitsuba::refuse_together(props, name, {"structure"},
                                         "the file holds the compact structure; leave one of them out");
-    if (glints_mitsuba::filter_parameters(props).filter == glints::FootprintFilter::Gaussian)
-        glints_mitsuba::refuse_together(props, name, {"footprint_filter"},
-                                        "an inverse bin map has no Gaussian footprint; leave one of them out");
     if (!map) {
         glints_mitsuba::refuse_together(
             props, name, {"encoding", "flip_y"},
@@ -191,7 +191,8 @@ static glints::Brdf load_brdf(const mitsuba::Properties &props, const glints::No
         surface.distribution = saved.distribution;
     if (!props.has_property("normalization"))
         surface.normalization = saved.normalization;
-    glints::Brdf brdf = glints::Brdf::load_inverse_bin_map(file, surface, map);
+    glints::Brdf brdf =
+        glints::Brdf::load_inverse_bin_map(file, surface, map, glints_mitsuba::filter_parameters(props));
     check_interpolation(props, file, brdf.statistics().refinement);
     return brdf;
 }

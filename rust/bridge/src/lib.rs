@@ -250,9 +250,15 @@ mod ffi {
             filter: FilterOptions,
         ) -> Result<Box<Brdf>>;
         fn saved_structure(filename: &str) -> Result<SavedStructure>;
-        fn load_inverse_bin_map(filename: &str, surface: Surface) -> Result<Box<Brdf>>;
+        fn load_inverse_bin_map(filename: &str, surface: Surface, filter: FilterOptions)
+        -> Result<Box<Brdf>>;
         /// Checks that the structure is that of a map.
-        fn load_inverse_bin_map_of(map: &Map, filename: &str, surface: Surface) -> Result<Box<Brdf>>;
+        fn load_inverse_bin_map_of(
+            map: &Map,
+            filename: &str,
+            surface: Surface,
+            filter: FilterOptions,
+        ) -> Result<Box<Brdf>>;
         fn unfiltered(map: &Map, surface: Surface, bilinear: bool) -> Result<Box<Brdf>>;
         fn yan16(map: &Map, surface: Surface, options: Yan16Options) -> Result<Box<Brdf>>;
         /// The file of a precomputation in the folder `cache`, whether it is there or not.
@@ -395,18 +401,21 @@ fn inverse_bin_map(
     interpolation: ffi::InterpolationOptions,
     filter: ffi::FilterOptions,
 ) -> Result<Box<Brdf>> {
-    if filter.gaussian {
-        return Err(Error::Parameter {
-            name: "footprint_filter",
-            value: "gaussian".into(),
-            reason: "an inverse bin map counts texels of equal weight, which only a box has; leave the parameter out, \
-                     or take glints_direct, or glints_yan16, whose footprint is a Gaussian"
-                .into(),
-        });
-    }
+    let footprint_filter = footprint_filter(filter)?;
     build(map, surface, interpolation, |map| {
         if is_compact(surface, options)? {
-            return Ok(Box::new(CompactBinMap::new(&map, flakes(surface)?)));
+            let structure = CompactBinMap::new(&map, flakes(surface)?);
+            return Ok(Box::new(structure.with_filter(footprint_filter)));
+        }
+        if filter.gaussian {
+            return Err(Error::Parameter {
+                name: "footprint_filter",
+                value: "gaussian".into(),
+                reason: "the paper's inverse bin map, which structure = paper, bins, leaf_size, binning and alpha = 0 \
+                         ask for, counts texels of equal weight, which only a box has; leave the parameter out, or \
+                         take structure = compact with a roughness, or glints_direct"
+                    .into(),
+            });
         }
         if surface.alpha == 0.0 {
             let options = specular_options(surface, options)?;
@@ -439,15 +448,30 @@ fn saved_structure(filename: &str) -> Result<ffi::SavedStructure> {
     })
 }
 
-fn load_inverse_bin_map(filename: &str, surface: ffi::Surface) -> Result<Box<Brdf>> {
-    load(filename, surface, None)
+fn load_inverse_bin_map(
+    filename: &str,
+    surface: ffi::Surface,
+    filter: ffi::FilterOptions,
+) -> Result<Box<Brdf>> {
+    load(filename, surface, filter, None)
 }
 
-fn load_inverse_bin_map_of(map: &Map, filename: &str, surface: ffi::Surface) -> Result<Box<Brdf>> {
-    load(filename, surface, Some(&map.0))
+fn load_inverse_bin_map_of(
+    map: &Map,
+    filename: &str,
+    surface: ffi::Surface,
+    filter: ffi::FilterOptions,
+) -> Result<Box<Brdf>> {
+    load(filename, surface, filter, Some(&map.0))
 }
 
-fn load(filename: &str, surface: ffi::Surface, map: Option<&NormalMap>) -> Result<Box<Brdf>> {
+fn load(
+    filename: &str,
+    surface: ffi::Surface,
+    filter: ffi::FilterOptions,
+    map: Option<&NormalMap>,
+) -> Result<Box<Brdf>> {
+    let filter = footprint_filter(filter)?;
     guarded("structure_file", filename, || {
         let flakes = Flakes {
             alpha: surface.alpha,
@@ -461,7 +485,7 @@ fn load(filename: &str, surface: ffi::Surface, map: Option<&NormalMap>) -> Resul
             None => None,
         };
         let size = map.map_or(saved.header().map, |map| (map.width(), map.height()));
-        let core = saved.into_brdf(masking(surface), map)?;
+        let core = saved.with_filter(filter).into_brdf(masking(surface), map)?;
         Ok(Box::new(Brdf {
             core,
             map: size,
@@ -525,6 +549,13 @@ fn specular_options(surface: ffi::Surface, options: ffi::InverseBinMapOptions) -
     })
 }
 
+fn footprint_filter(filter: ffi::FilterOptions) -> Result<FootprintFilter> {
+    match filter.gaussian {
+        true => FootprintFilter::gaussian(filter.footprint_sigma),
+        false => Ok(FootprintFilter::Box),
+    }
+}
+
 fn inverse_bin_map_options(bins: u32, leaf_size: u32) -> inverse_bin_map::Options {
     inverse_bin_map::Options {
         bins: (bins > 0).then_some(bins),
@@ -538,10 +569,7 @@ fn direct(
     interpolation: ffi::InterpolationOptions,
     filter: ffi::FilterOptions,
 ) -> Result<Box<Brdf>> {
-    let filter = match filter.gaussian {
-        true => FootprintFilter::gaussian(filter.footprint_sigma)?,
-        false => FootprintFilter::Box,
-    };
+    let filter = footprint_filter(filter)?;
     build(map, surface, interpolation, |map| {
         let direct = Direct::with_filter(map.into_owned(), flakes(surface)?, filter);
         Ok(Box::new(direct))

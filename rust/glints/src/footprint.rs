@@ -247,7 +247,7 @@ impl Parallelogram {
         })
     }
 
-    fn moved(&self, by: DVec2) -> Self {
+    pub(crate) fn moved(&self, by: DVec2) -> Self {
         Self {
             center: self.center + by,
             ..*self
@@ -313,7 +313,7 @@ impl Parallelogram {
         0.5 * (self.edges[0].abs() + self.edges[1].abs())
     }
 
-    fn is_within(&self, low: DVec2, high: DVec2) -> bool {
+    pub(crate) fn is_within(&self, low: DVec2, high: DVec2) -> bool {
         let e = self.half_extents();
         (self.center - e).cmpge(low).all() && (self.center + e).cmple(high).all()
     }

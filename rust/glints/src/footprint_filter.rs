@@ -50,10 +50,10 @@ use crate::gaussian_footprint::{GaussianFootprint, Reach, checked_deviation};
 pub const RADIUS: f64 = 3.741_657_386_773_941_4;
 
 /// Mass of `N(z_x) N(z_y)` in the square `|z| <= RADIUS`, `erf(RADIUS / sqrt 2)^2`.
-const KEPT: f64 = 0.999_634_412_153_763_8;
+pub(crate) const KEPT: f64 = 0.999_634_412_153_763_8;
 
 /// Longest edge, in deviations, of a rectangle that the Taylor series answers for.
-const LONGEST_SMALL: f64 = 0.35;
+pub(crate) const LONGEST_SMALL: f64 = 0.35;
 
 /// Longest step of the Gauss-Legendre rule along the sides of a clipped rectangle, in deviations.
 const STEP: f64 = 1.0;
@@ -180,20 +180,85 @@ impl FilteredFootprint {
     /// A texel, drawn with its weight as probability by two independent uniform numbers on [0, 1).
     #[inline]
     pub fn sample_texel(&self, u: [f64; 2]) -> (u32, u32) {
+        self.sample_part(u).0
+    }
+
+    /// The same, and the window over the tile that the texel was drawn in; `None` for a point, and for what weights
+    /// all texels of the map evenly.
+    #[inline]
+    pub fn sample_part(&self, u: [f64; 2]) -> ((u32, u32), Option<Window>) {
+        let size = self.footprint.map_size();
         match &self.support {
-            Support::Box => self.footprint.sample_texel(u),
+            Support::Box => {
+                let (texel, region) = self.footprint.sample_part(u);
+                (texel, region.map(|region| self.window(region)))
+            }
             Support::Gaussian(region) => {
                 let st = DVec2::from(u.map(|u| truncated_normal(u) / (2.0 * RADIUS)));
-                self.footprint.texel_at(region.point(st))
+                let point = region.point(st);
+                let tile = (point / size).floor() * size;
+                let texel = self.footprint.texel_at(point);
+                (texel, Some(self.window(region.moved(-tile))))
             }
-            Support::Even => self
-                .footprint
-                .texel_at(DVec2::from(u) * self.footprint.map_size()),
+            Support::Even => (self.footprint.texel_at(DVec2::from(u) * size), None),
         }
+    }
+
+    /// What the filter reaches, in unwrapped texel coordinates; `None` for a point, and for what weights all texels of
+    /// the map evenly.
+    #[inline]
+    pub fn region(&self) -> Option<&Parallelogram> {
+        match &self.support {
+            Support::Box => self.footprint.region(),
+            Support::Gaussian(region) => Some(region),
+            Support::Even => None,
+        }
+    }
+
+    /// [`Window::texel_in_deviations`], the same in all windows; `None` for a point, too.
+    #[inline]
+    pub fn texel_in_deviations(&self) -> Option<[DVec2; 2]> {
+        self.region()
+            .and_then(|region| self.window(*region).texel_in_deviations())
+    }
+
+    /// The only window, if the filter reaches no further than one period of the map.
+    #[inline]
+    pub fn single_window(&self) -> Option<Window> {
+        let region = match &self.support {
+            Support::Box => self.footprint.single_part()?,
+            Support::Gaussian(region) if region.is_within(DVec2::ZERO, self.footprint.map_size()) => region,
+            _ => return None,
+        };
+        Some(self.window(*region))
+    }
+
+    fn window(&self, region: Parallelogram) -> Window {
+        let shape = match self.support {
+            Support::Box => Shape::Box(1.0 / self.footprint.area()),
+            _ => Shape::Gaussian,
+        };
+        Window { region, shape }
     }
 }
 
 impl Window {
+    /// Outside of it weights are zero.
+    #[inline]
+    pub fn region(&self) -> &Parallelogram {
+        &self.region
+    }
+
+    /// By how many of its deviations a Gaussian's argument z changes along each axis of the pixel, over the width and
+    /// over the height of a texel; `None` for the box.
+    #[inline]
+    pub fn texel_in_deviations(&self) -> Option<[DVec2; 2]> {
+        match self.shape {
+            Shape::Box(_) => None,
+            Shape::Gaussian => Some(self.whitened_edges(DVec2::ONE)),
+        }
+    }
+
     /// How the box `[low, high]` lies: `Outside` weighs nothing, and `Inside` every texel weighs the same,
     /// [`Window::even_weight`]. Nothing is `Inside` under a Gaussian.
     #[inline]

@@ -17,6 +17,7 @@ use rayon::prelude::*;
 use crate::brdf::{Brdf, Masking};
 use crate::error::{Error, Result};
 use crate::flakes::Normalization;
+use crate::footprint_filter::FootprintFilter;
 use crate::methods::compact::{CompactBinMap, Header, read_header};
 use crate::microfacet::{Distribution, Flake};
 use crate::normal_map::{NormalMap, SlopeCovariance};
@@ -230,6 +231,14 @@ impl SavedMap {
             _ => SlopeCovariance::default(),
         };
         Brdf::with_slopes(|| slopes, masking, || Ok(Box::new(self.structure)))
+    }
+
+    /// The same, seen through `filter`; a file knows none, and has the pixel's box at first.
+    pub fn with_filter(self, filter: FootprintFilter) -> Self {
+        Self {
+            structure: self.structure.with_filter(filter),
+            ..self
+        }
     }
 
     /// The structure alone.

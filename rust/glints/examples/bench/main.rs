@@ -13,6 +13,8 @@
 //!   alive after the build and was not before, the map left out; `*/build_peak` the most that was alive during it.
 //! * `*/build` wall-clock time, with all cores; `*/build_cpu` processor time of the whole process.
 //! * `*/eval`, `*/pdf`, `*/sample`, `*/three_calls` processor time of the thread for a query.
+//! * `ibm_gaussian/eval`, `/sample` the compact inverse bin map under a Gaussian of half a pixel, against its own box;
+//!   `ibm_gaussian/ndf_error` the distance to the direct sum under the same Gaussian.
 //! * `direct_gaussian/eval`, `/sample` the direct sum under a Gaussian of half a pixel, against the box's.
 //! * `*/ndf_error` relative L1 distance to the direct sum, where that takes no more than [`cost::LARGEST_DIRECT`] texels;
 //!   larger footprints have no such row.
@@ -147,10 +149,20 @@ fn measure(
     let published = brdf(Box::new(published.method))?;
     let direct = brdf(Box::new(direct))?;
     let filter = FootprintFilter::gaussian(yan16::Options::default().footprint_sigma)?;
-    let gaussian = brdf(Box::new(Direct::with_filter(map.clone(), model, filter)))?;
+    let gaussian = Direct::with_filter(map.clone(), model, filter);
+    let ours_gaussian = CompactBinMap::new(map, model).with_filter(filter);
+    for cell in arguments.footprint.iter().filter(|cell| cell.is_direct()) {
+        let error = error::of_distribution(&ours_gaussian, &gaussian, cell);
+        let params = with(params, &cell.params());
+        let name = "ibm_gaussian/ndf_error";
+        print(name, error, "relative L1", ("bound", 0.03), &params);
+    }
+    let gaussian = brdf(Box::new(gaussian))?;
+    let ours_gaussian = brdf(Box::new(ours_gaussian))?;
     for cell in &arguments.footprint {
         let params = with(params, &cell.params());
-        let eval = measure_queries(arguments, [&ours, &published, &direct, &gaussian], cell, &params);
+        let boxes = [&ours, &published, &direct];
+        let eval = measure_queries(arguments, boxes, [&ours_gaussian, &gaussian], cell, &params);
         for (summary, nanoseconds) in summaries.iter_mut().zip(eval) {
             summary.evals.push((nanoseconds, params.clone()));
         }
@@ -188,7 +200,8 @@ fn measure_structures(
 /// Prints what the queries of a cell cost; returns the evaluations' of the compact and of the published structure.
 fn measure_queries(
     arguments: &Arguments,
-    [ours, published, direct, gaussian]: [&Brdf; 4],
+    [ours, published, direct]: [&Brdf; 3],
+    [ours_gaussian, gaussian]: [&Brdf; 2],
     cell: &Cell,
     params: &Value,
 ) -> [f64; 2] {
@@ -204,6 +217,12 @@ fn measure_queries(
             evals = found;
         }
     }
+    let eval = nanoseconds(ours_gaussian, cost::eval);
+    let name = "ibm_gaussian/eval";
+    print(name, eval, "nanoseconds", ("ibm", evals[0]), params);
+    let sample = [ours_gaussian, ours].map(|brdf| nanoseconds(brdf, cost::sample));
+    let name = "ibm_gaussian/sample";
+    print(name, sample[0], "nanoseconds", ("ibm", sample[1]), params);
     if cell.is_direct() {
         let exact = nanoseconds(direct, cost::eval);
         print("direct/eval", exact, "nanoseconds", ("ibm", evals[0]), params);

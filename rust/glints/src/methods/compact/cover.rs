@@ -12,13 +12,43 @@
 //! a random walk over the cut nodes, since each has too much as often as too little. A node is small if that is below
 //! [`TOLERANCE`]. How much parts deviate is measured where there are counts ([`super::counts::Counts::deviations`]): by
 //! chance, and by the map's streaks and flakes.
+//!
+//! **Under a Gaussian** ([`crate::footprint_filter`]) no node has even weights. One is taken as a whole, with the Gaussian's
+//! mean over it, where it is small. Over a node with the edges U, V in deviations the Gaussian varies by about
+//! `sqrt((z.U)^2 + (z.V)^2) / sqrt 12` of itself; summed over all nodes as a random walk, with the Gaussian's integrals, the
+//! error is
+//!
+//! ```text
+//! sqrt(|U x V| (|U|^2 + |V|^2) / (96 pi)) d,
+//! ```
+//!
+//! and must be below [`GAUSSIAN_SHARE`] of the tolerance: then all of the footprint is counted, with the counts' own noise,
+//! and not only what a box holds inside.
 
 use glam::DVec2;
 
-use crate::footprint::{Coverage, Footprint, Parallelogram};
+use crate::footprint::{Coverage, Footprint};
+use crate::footprint_filter::Window;
 
 /// Relative error that blurring the border may cost. Measured, it is half to all of what the formula says.
 const TOLERANCE: f64 = 0.025;
+
+/// Share of that which the nodes under a Gaussian may take.
+const GAUSSIAN_SHARE: f64 = 0.6;
+
+/// Error of nodes of a side that are cut by the border of a box, per deviation.
+pub fn error_of_box(footprint: &Footprint) -> impl Fn(f64) -> f64 + use<> {
+    let perimeter: f64 = footprint.edges().iter().map(|edge| 2.0 * edge.length()).sum();
+    let area = footprint.area();
+    move |side| 0.25 * ((perimeter / side).sqrt() * side * side / area)
+}
+
+/// Error of nodes of a side under a Gaussian, per deviation; `[u, v]`: a texel's edges in deviations of the Gaussian.
+pub fn error_of_gaussian([u, v]: [DVec2; 2]) -> impl Fn(f64) -> f64 {
+    let squares = u.perp_dot(v).abs() * (u.length_squared() + v.length_squared());
+    let per_area = (squares / (96.0 * std::f64::consts::PI)).sqrt();
+    move |side| per_area * side * side / GAUSSIAN_SHARE
+}
 
 /// A rectangle of texels, half open.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -57,7 +87,7 @@ pub enum Treatment {
     Descend,
     /// All its texels alike, each with this weight.
     Whole(f64),
-    /// A leaf's texels, each with its own area in the region.
+    /// A leaf's texels, each with its own weight.
     Texels,
 }
 
@@ -74,19 +104,36 @@ pub struct Scale {
 #[derive(Clone, Copy)]
 pub struct Part<'a> {
     /// `None`: all of the map.
-    region: Option<&'a Parallelogram>,
+    window: Option<&'a Window>,
+    is_even: bool,
     scale: Scale,
     /// Of s and t: gradient per texel, value at the map's corner, and variation over half a texel.
     slabs: [(DVec2, f64, f64); 2],
 }
 
 impl<'a> Part<'a> {
-    pub fn new(region: Option<&'a Parallelogram>, scale: Scale) -> Self {
-        let slabs = region.map_or([(DVec2::ZERO, 0.0, 0.0); 2], |region| {
-            let [s, t] = region.slabs_at(DVec2::ZERO);
+    pub fn new(window: Option<&'a Window>, scale: Scale) -> Self {
+        let slabs = window.map_or([(DVec2::ZERO, 0.0, 0.0); 2], |window| {
+            let [s, t] = window.region().slabs_at(DVec2::ZERO);
             [s, t].map(|(g, value)| (g, value, 0.5 * (g.x.abs() + g.y.abs())))
         });
-        Self { region, scale, slabs }
+        Self {
+            window,
+            is_even: window.is_none_or(|window| window.even_weight().is_some()),
+            scale,
+            slabs,
+        }
+    }
+
+    /// Mean weight of the texels of a rectangle; under a box, a texel inside weighs one.
+    fn mean_weight(&self, window: &Window, rect: &Rect) -> f64 {
+        let (low, high) = rect.bounds();
+        let sum = if self.is_even {
+            window.region().overlap(low, high)
+        } else {
+            window.weight(low, high)
+        };
+        sum / rect.area()
     }
 
     /// How a square of `side` texels, the map's side excepted, lies to the region.
@@ -161,13 +208,10 @@ impl Tree {
         self.map.0.div_ceil(self.side(level))
     }
 
-    /// Side in texels up to which a node is small against the footprint; `deviations`: of the parts of each level's nodes.
-    pub fn small_side(&self, footprint: &Footprint, deviations: &[f64]) -> f64 {
-        let perimeter: f64 = footprint.edges().iter().map(|edge| 2.0 * edge.length()).sum();
-        let is_small = |&(side, deviation): &(f64, f64)| {
-            let walk = (perimeter / side).sqrt() * side * side / footprint.area();
-            0.25 * walk * deviation <= TOLERANCE
-        };
+    /// Side in texels up to which a node is small against the footprint; `deviations`: of the parts of each level's nodes;
+    /// `error`: for a side, per deviation.
+    pub fn small_side(&self, error: impl Fn(f64) -> f64, deviations: &[f64]) -> f64 {
+        let is_small = |&(side, deviation): &(f64, f64)| error(side) * deviation <= TOLERANCE;
         let sides = (0..self.levels).map(|level| f64::from(self.side(level)));
         sides
             .zip(deviations.iter().copied())
@@ -238,7 +282,7 @@ impl Tree {
     #[inline]
     fn treatment(&self, part: &Part, node: &Node, is_unit: &impl Fn(usize) -> bool) -> Treatment {
         let whole = is_unit(node.level);
-        let Some(region) = part.region else {
+        let Some(window) = part.window else {
             let ends_here = whole || node.level == part.scale.leaf;
             return if ends_here {
                 Treatment::Whole(1.0)
@@ -252,11 +296,9 @@ impl Tree {
         let corner = DVec2::new(f64::from(node.column), f64::from(node.row)) * side;
         match part.coverage(corner, side) {
             Coverage::Outside => Treatment::Nothing,
-            Coverage::Inside if whole => Treatment::Whole(1.0),
-            Coverage::Cut if whole && side <= part.scale.small => {
-                let rect = self.rect(node);
-                let (low, high) = rect.bounds();
-                Treatment::Whole(region.overlap(low, high) / rect.area())
+            Coverage::Inside if whole && part.is_even => Treatment::Whole(1.0),
+            _ if whole && side <= part.scale.small => {
+                Treatment::Whole(part.mean_weight(window, &self.rect(node)))
             }
             _ if node.level == part.scale.leaf => Treatment::Texels,
             _ => Treatment::Descend,

@@ -196,7 +196,7 @@ impl Tiles {
         ]
     }
 
-    /// Adds the texels of a footprint inside `rect`, each with its area. A rectangle begins and ends with a tile, or with the
+    /// Adds the texels of a footprint inside `rect`, each with its weight. A rectangle begins and ends with a tile, or with the
     /// map.
     pub fn add(&self, border: &Border, rect: &Rect, sums: &mut Sums) {
         let Some(window) = Window::new(sums, &self.grid, self.lower_bits) else {
@@ -206,11 +206,12 @@ impl Tiles {
         let mut batch = Batch::new();
         let (columns, rows) = tiles_of(rect);
         let rows = rows.start.into()..rows.end.into();
+        let is_even = border.is_even();
         for span in border.region.spans_of_rows(DVec2::splat(SIDE.into()), rows) {
             let clamp = |column: i64| column.clamp(columns.start.into(), columns.end.into()) as u32;
             for column in clamp(span.touched.0)..clamp(span.touched.1) {
                 let row = span.row as u32;
-                let inside = (span.inside.0..span.inside.1).contains(&i64::from(column));
+                let inside = is_even && (span.inside.0..span.inside.1).contains(&i64::from(column));
                 let texels = if inside {
                     u64::MAX
                 } else {

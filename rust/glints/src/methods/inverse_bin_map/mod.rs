@@ -34,7 +34,8 @@
 //! The footprint is the pixel's box. A Gaussian one ([`crate::footprint_filter`], the paper's future work) has no
 //! use for the forest as it is: a node answers by its number of texels where all of them weigh the same, and under
 //! a Gaussian no two do. Nodes whose weights are even to 1e-3 of the peak are a thousandth of a standard deviation
-//! wide: the query would be a sum over single texels.
+//! wide: the query would be a sum over single texels. The compact structure ([`super::compact`]) has one, by weighting
+//! texels one by one, and nodes by their mean where they are small against the Gaussian.
 //!
 //! **Layout**, for N texels and b^2 bins:
 //!
