@@ -330,7 +330,8 @@ impl<'a> Border<'a> {
                 match touched & !inside {
                     0 => (weights & mask(touched), 0),
                     _ if gaussian.is_fine => {
-                        (weights * self.areas(touched, columns, rows) & mask(touched), 0)
+                        let areas = self.areas(touched, columns, rows);
+                        ((weights * areas) & mask(touched), 0)
                     }
                     cut => (weights & mask(touched), cut),
                 }
