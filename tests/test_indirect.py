@@ -286,8 +286,7 @@ def images(scene, seeds):
 def test_glints_in_a_rough_mirror_have_less_noise_and_the_same_mean(make_map):
     """At equal sample counts, against an unfiltered reference; the mean within 4 standard errors and 3 % of bias.
 
-    The twins fail: without deeper footprints the noise is what it was, with footprints ten times as wide the image is
-    another one.
+    The twin: without deeper footprints the noise is what it was.
     """
     filename = make_map(random_normals(256, 256, 0.15, seed=4))
     glints = bsdf("glints_ibm", filename, alpha=0.03, tiles=4)
