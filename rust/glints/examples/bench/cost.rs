@@ -12,6 +12,9 @@ use serde_json::{Value, json};
 /// Texels of the largest footprint that the direct sum is asked over, some ten milliseconds a query.
 pub const LARGEST_DIRECT: f64 = 2048.0 * 2048.0;
 
+/// The same under a Gaussian, which reaches 14 times as many and weights each by itself: some ten milliseconds, too.
+pub const LARGEST_DIRECT_GAUSSIAN: f64 = 64.0 * 64.0;
+
 /// Length and thickness of a footprint in texels.
 #[derive(Clone, Copy)]
 pub struct Cell {
@@ -45,6 +48,11 @@ impl Cell {
     /// Whether the direct sum is affordable.
     pub fn is_direct(&self) -> bool {
         self.texels() <= LARGEST_DIRECT
+    }
+
+    /// Whether it is under a Gaussian.
+    pub fn is_direct_gaussian(&self) -> bool {
+        self.texels() <= LARGEST_DIRECT_GAUSSIAN
     }
 
     pub fn texels(&self) -> f64 {

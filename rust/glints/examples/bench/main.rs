@@ -14,7 +14,8 @@
 //! * `*/build` wall-clock time, with all cores; `*/build_cpu` processor time of the whole process.
 //! * `*/eval`, `*/pdf`, `*/sample`, `*/three_calls` processor time of the thread for a query.
 //! * `ibm_gaussian/eval`, `/sample` the compact inverse bin map under a Gaussian of half a pixel, against its own box;
-//!   `ibm_gaussian/ndf_error` the distance to the direct sum under the same Gaussian.
+//!   `ibm_gaussian/ndf_error` the distance to the direct sum under the same Gaussian, up to
+//!   [`cost::LARGEST_DIRECT_GAUSSIAN`] texels.
 //! * `direct_gaussian/eval`, `/sample` the direct sum under a Gaussian of half a pixel, against the box's.
 //! * `*/ndf_error` relative L1 distance to the direct sum, where that takes no more than [`cost::LARGEST_DIRECT`] texels;
 //!   larger footprints have no such row.
@@ -151,7 +152,11 @@ fn measure(
     let filter = FootprintFilter::gaussian(yan16::Options::default().footprint_sigma)?;
     let gaussian = Direct::with_filter(map.clone(), model, filter);
     let ours_gaussian = CompactBinMap::new(map, model).with_filter(filter);
-    for cell in arguments.footprint.iter().filter(|cell| cell.is_direct()) {
+    for cell in arguments
+        .footprint
+        .iter()
+        .filter(|cell| cell.is_direct_gaussian())
+    {
         let error = error::of_distribution(&ours_gaussian, &gaussian, cell);
         let params = with(params, &cell.params());
         let name = "ibm_gaussian/ndf_error";
@@ -226,6 +231,9 @@ fn measure_queries(
     if cell.is_direct() {
         let exact = nanoseconds(direct, cost::eval);
         print("direct/eval", exact, "nanoseconds", ("ibm", evals[0]), params);
+        if !cell.is_direct_gaussian() {
+            return evals;
+        }
         let eval = nanoseconds(gaussian, cost::eval);
         let name = "direct_gaussian/eval";
         print(name, eval, "nanoseconds", ("direct", exact), params);

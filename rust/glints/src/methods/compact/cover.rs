@@ -30,8 +30,8 @@ use glam::DVec2;
 use crate::footprint::{Coverage, Footprint};
 use crate::footprint_filter::Window;
 
-/// Relative error that blurring the border may cost. Measured, it is half to all of what the formula says.
-const TOLERANCE: f64 = 0.025;
+/// Relative error that blurring the border may cost. Measured, it is half to one and a half of what the formula says.
+const TOLERANCE: f64 = 0.016;
 
 /// Share of that which the nodes under a Gaussian may take.
 const GAUSSIAN_SHARE: f64 = 0.6;

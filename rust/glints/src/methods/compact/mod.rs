@@ -38,8 +38,8 @@
 //!
 //! **Exactness** Quantisation is at most about a twentieth of a lobe's standard deviation (for alpha >= 0.003; below, where
 //! 32 bits do not suffice, a step grows to 1e-4), which is up to 1.9 % of relative L1 error for a single lobe, less for
-//! several. Counts and blurred borders cost up to 1.9 % for footprints of a quarter of a thousand texels' width and more on
-//! the maps of the scenes. Sampling, density and evaluation are exact partners: lobes are truncated for all three, and
+//! several. Counts and blurred borders cost up to 2.3 % for footprints of more than a hundred texels' width on the maps of the
+//! scenes. Sampling, density and evaluation are exact partners: lobes are truncated for all three, and
 //! `sample` treats a texel as the cover of the footprint does.
 //!
 //! **Bounds** A footprint of one texel takes about a microsecond, and one that covers the map evenly less, where there are
