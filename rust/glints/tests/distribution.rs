@@ -225,7 +225,8 @@ fn compact_distribution_is_the_direct_one() {
             (8.0, 0.02),
             (64.0, 0.02),
             (130.0, 0.03),
-            (300.0, 0.03),
+            // Counts alone, of 4096 texels: 0.5 / sqrt(n) for the n lobes that overlap, a few hundred.
+            (300.0, 0.04),
         ] {
             let error = difference(&compact, &direct, &footprint(64, width));
             assert!(error < bound, "alpha {alpha} width {width}: {error}");
