@@ -464,6 +464,7 @@ def test_a_comparison_of_one_method_and_one_seed_has_a_page_too(browser, tmp_pat
     results.settings = dataclasses.replace(results.settings, methods=(METHODS["normalmap"],))
     results.references = {key: kept for key, kept in results.references.items() if key[2:] == ("texels", "crop1")}
     results.sweep, results.temporal, results.left_out, results.warnings = [], [], [], {}
+    results.prefiltering = []
     with opened(browser, report_page.write(results), 800, 600) as page:
         assert page.locator("#stage-label").inner_text() == "Reference · texels"
         page.evaluate("choose({ case: 1, pinned: 0 })")
@@ -608,9 +609,13 @@ def test_the_readout_gives_the_value_under_the_pointer(page, written):
 
 
 def test_invalid_pixels_are_magenta_and_counted(page):
-    page.keyboard.press("8")
-    settle(page)
-    assert page.locator("#stage-label").inner_text() == "Stock normalmap"
+    label = page.locator("#stage-label")
+    for _ in METHODS:
+        if label.inner_text() == "Stock normalmap":
+            break
+        page.keyboard.press("ArrowRight")
+        settle(page)
+    assert label.inner_text() == "Stock normalmap"
     assert "1 invalid pixel" in page.locator("#stage-detail").inner_text()
     stage = pixels(page)
     y, x = int(stage.shape[0] * 3.5 / SIDE), int(stage.shape[1] * 4.5 / SIDE)
