@@ -96,18 +96,7 @@ impl Kind {
     /// # Errors
     /// The file cannot be written; nothing is left of it.
     pub fn write(&self, path: &Path, fields: &[u32], sections: &[Section]) -> io::Result<()> {
-        if cfg!(target_endian = "big") {
-            return Err(io::Error::other("only little-endian machines save structures"));
-        }
-        let folder = match path.parent() {
-            Some(folder) if !folder.as_os_str().is_empty() => folder,
-            _ => Path::new("."),
-        };
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".glints-");
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let mut file = builder.tempfile_in(folder)?;
+        let mut file = temporary_beside(path)?;
         file.write_all(&self.preamble(fields, sections))?;
         let mut end = FIELDS + 4 * fields.len() + ENTRY * sections.len();
         for section in sections {
@@ -289,4 +278,22 @@ fn write_section<E>(
 
 fn unreadable(error: io::Error) -> String {
     format!("cannot be read ({error}); check its name and its permissions")
+}
+/// An empty temporary file in the folder of `path`, to be written and then given that name.
+///
+/// # Errors
+/// The file cannot be made, or the machine's byte order is not that of saved structures.
+pub(crate) fn temporary_beside(path: &Path) -> io::Result<tempfile::NamedTempFile> {
+    if cfg!(target_endian = "big") {
+        return Err(io::Error::other("only little-endian machines save structures"));
+    }
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".glints-");
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    builder.tempfile_in(folder)
 }

@@ -58,6 +58,7 @@ use super::grid::Grid;
 use super::tiles::Tiles;
 use super::{CompactBinMap, LEAF_BITS, Texels};
 use crate::array::Array;
+use crate::container::temporary_beside;
 use crate::error::{Error, Result};
 use crate::flakes::{FlakeModel, Normalization};
 use crate::microfacet::{Distribution, Flake};
@@ -195,18 +196,7 @@ impl CompactBinMap {
     }
 
     fn write(&self, path: &Path) -> io::Result<()> {
-        if cfg!(target_endian = "big") {
-            return Err(io::Error::other("only little-endian machines save structures"));
-        }
-        let folder = match path.parent() {
-            Some(folder) if !folder.as_os_str().is_empty() => folder,
-            _ => Path::new("."),
-        };
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".glints-");
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let mut file = builder.tempfile_in(folder)?;
+        let mut file = temporary_beside(path)?;
         let sections = self.sections();
         file.write_all(&self.preamble(&sections))?;
         for_each_chunk(&sections, |bytes| file.write_all(bytes))?;
