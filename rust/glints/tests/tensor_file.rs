@@ -1,8 +1,12 @@
 //! No file, whatever is in it, makes loading or a query of tensor-decomposed distributions panic.
 
+#[path = "fuzz/container.rs"]
+mod container;
+
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
+use container::{COUNTS, LENGTH, Random, seal, table, u32_at};
 use glam::{DVec2, Vec2, Vec3};
 use glints::flakes::{FlakeModel, Normalization};
 use glints::footprint::Footprint;
@@ -12,64 +16,9 @@ use glints::methods::tensor::{Options, Tensor, read_header};
 use glints::microfacet::{Distribution, Flake};
 use glints::normal_map::NormalMap;
 
-/// Where a container's fields are; see the module `container`.
-const HEADER_SUM: usize = 16;
-const BODY_SUM: usize = 20;
-const LENGTH: usize = 24;
-const COUNTS: usize = 32;
-const FIELDS: usize = 40;
-const ENTRY: usize = 24;
-
-/// SplitMix64.
-struct Random(u64);
-
-impl Random {
-    fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ z >> 31
-    }
-
-    fn below(&mut self, count: usize) -> usize {
-        (self.bits() % count.max(1) as u64) as usize
-    }
-
-    fn real(&mut self) -> f32 {
-        (self.bits() >> 40) as f32 / (1 << 24) as f32
-    }
-}
-
-fn u32_at(bytes: &[u8], at: usize) -> usize {
-    bytes
-        .get(at..at + 4)
-        .map_or(0, |b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize)
-}
-
-/// Where the table of sections ends.
-fn table_end(bytes: &[u8]) -> usize {
-    let (fields, sections) = (u32_at(bytes, COUNTS), u32_at(bytes, COUNTS + 4));
-    (FIELDS + 4 * fields + ENTRY * sections).clamp(FIELDS, bytes.len().max(FIELDS))
-}
-
-/// Sets length and checksums, so that the checks behind them are what is tested.
-fn seal(bytes: &mut [u8]) {
-    if bytes.len() <= FIELDS {
-        return;
-    }
-    let length = (bytes.len() as u64).to_le_bytes();
-    bytes[LENGTH..LENGTH + 8].copy_from_slice(&length);
-    let end = table_end(bytes);
-    let body = crc32fast::hash(&bytes[end..]).to_le_bytes();
-    bytes[BODY_SUM..BODY_SUM + 4].copy_from_slice(&body);
-    let head = crc32fast::hash(&bytes[BODY_SUM..end]).to_le_bytes();
-    bytes[HEADER_SUM..HEADER_SUM + 4].copy_from_slice(&head);
-}
-
 fn mutate(bytes: &mut Vec<u8>, random: &mut Random) {
     for _ in 0..1 + random.below(3) {
-        let end = table_end(bytes);
+        let [_, end] = table(bytes);
         match random.below(6) {
             // A number of the header or the table.
             0 | 1 => {
@@ -78,7 +27,7 @@ fn mutate(bytes: &mut Vec<u8>, random: &mut Random) {
                     0 => random.bits() as u32,
                     1 => random.below(300) as u32,
                     2 => u32::MAX - random.below(3) as u32,
-                    _ => (u32_at(bytes, at) as u32)
+                    _ => u32_at(bytes, at)
                         .wrapping_add(random.below(5) as u32)
                         .wrapping_sub(2),
                 };
@@ -104,6 +53,10 @@ fn mutate(bytes: &mut Vec<u8>, random: &mut Random) {
                 bytes.truncate(length);
             }
         }
+    }
+    let length = (bytes.len() as u64).to_le_bytes();
+    if let Some(place) = bytes.get_mut(LENGTH..LENGTH + 8) {
+        place.copy_from_slice(&length);
     }
     seal(bytes);
 }

@@ -117,7 +117,7 @@ pub fn is_saved(path: &Path) -> bool {
 pub fn read_header(path: &Path) -> Result<Header> {
     let read = || {
         let contents = KIND.read(path)?;
-        let file_bytes = contents.length;
+        let file_bytes = contents.head.length;
         let saved = Saved::new(contents)?;
         let [.., resolution, stride, levels] = saved.fields;
         let ranks = saved.images.ranks();
@@ -279,11 +279,10 @@ impl Saved {
     /// What a query relies on is checked here; not what only makes answers wrong: a file with a right checksum was written as it
     /// is.
     fn checked(contents: &mut Contents) -> Checked<Self> {
-        let fields: [u32; 7] = contents
-            .fields
-            .as_slice()
+        let fields = contents.head.fields.as_slice();
+        let fields: [u32; 7] = fields
             .try_into()
-            .map_err(|_| format!("{} fields", contents.fields.len()))?;
+            .map_err(|_| format!("{} fields", fields.len()))?;
         let [width, height, alpha, distribution, resolution, stride, levels] = fields;
         let fits = |side: u32| (1..=MAX_SIDE).contains(&side);
         demand(fits(width) && fits(height), "the size of the map")?;
@@ -306,21 +305,16 @@ impl Saved {
         )?;
         let geometry = geometry.coarsened(levels as usize);
 
-        let missing = || "a section is missing".to_string();
         let parts = Parts {
-            groups: contents.take().ok_or_else(missing)?,
-            masks: contents.take().ok_or_else(missing)?,
-            factors: contents.take().ok_or_else(missing)?,
-            scales: contents.take().ok_or_else(missing)?,
-            masses: contents.take().ok_or_else(missing)?,
-            totals: contents.take().ok_or_else(missing)?,
+            groups: contents.take()?,
+            masks: contents.take()?,
+            factors: contents.take()?,
+            scales: contents.take()?,
+            masses: contents.take()?,
+            totals: contents.take()?,
         };
-        let normals: Array<[u16; 2]> = contents.take().ok_or_else(missing)?;
+        let normals = contents.take_exactly(u64::from(width) * u64::from(height))?;
         check_parts(&geometry, &parts)?;
-        demand(
-            normals.len() as u64 == u64::from(width) * u64::from(height),
-            "the number of normals",
-        )?;
         Ok(Self {
             fields,
             model: FlakeModel {
