@@ -235,7 +235,12 @@ Brdf Brdf::inverse_bin_map(const NormalMap &map, const SurfaceOptions &surface, 
 SavedStructure SavedStructure::read(const std::string &structure_file) {
     return translated([&] {
         bridge::SavedStructure s = bridge::saved_structure(utf8(structure_file, "structure_file"));
-        return SavedStructure{s.width, s.height, s.alpha, from_bridge(s.distribution),
+        return SavedStructure{s.width,
+                              s.height,
+                              s.refinement,
+                              s.refinement_step,
+                              s.alpha,
+                              from_bridge(s.distribution),
                               s.projected ? Normalization::Projected : Normalization::Paper};
     });
 }

@@ -190,7 +190,9 @@ private:
 
 /// What a structure was made for that `glints precompute ibm` saved.
 struct GLINTS_API SavedStructure {
-    uint32_t width, height; ///< of the map, with `refinement` texels for each of an interpolated one
+    uint32_t width, height; ///< of the map
+    uint32_t refinement;    ///< refined texels per texel and side, if the map was interpolated; 0 if not
+    float refinement_step;  ///< their mean step in standard deviations of a lobe; 0 without
     float alpha;
     Distribution distribution;
     Normalization normalization;
@@ -275,9 +277,8 @@ public:
                                 const InterpolationOptions &interpolation = {}, const FilterOptions &filter = {});
     /// The same from a file of `glints precompute ibm`, which is mapped into memory: it may be replaced or removed later, but
     /// must not be written to or shortened. `surface.alpha`, `distribution` and `normalization` must be those of the file,
-    /// see `SavedStructure`. `map` may be null; otherwise it must be the map that the file was made from, and `Masking::
-    /// Beckmann` is made of its slopes instead of those in the file, which are quantised (and of an interpolated map, those
-    /// of the refined one).
+    /// see `SavedStructure`. `map` may be null; otherwise it must be the map that the file was made from. Answers are those of
+    /// the structure that is built from that map, bit for bit.
     static Brdf load_inverse_bin_map(const std::string &structure_file, const SurfaceOptions &surface,
                                      const NormalMap *map = nullptr, const FilterOptions &filter = {});
     /// The exact sum over every texel of the footprint (Eq. 11).

@@ -21,7 +21,7 @@ use glints::flakes::{FlakeModel, Normalization};
 use glints::footprint_filter::FootprintFilter;
 use glints::gtr::Gtr;
 use glints::methods::Method;
-use glints::methods::compact::CompactBinMap;
+use glints::methods::compact::{CompactBinMap, Origin};
 use glints::methods::direct::Direct;
 use glints::methods::inverse_bin_map::{self, Binning, InverseBinMap, SpecularBinMap, SpecularOptions};
 use glints::methods::tensor::{self, Tensor};
@@ -121,10 +121,12 @@ mod ffi {
         binning: BinningKind,
     }
 
-    /// What a saved structure was made for.
+    /// What a saved structure was made for; refinement of zero: without interpolation.
     struct SavedStructure {
         width: u32,
         height: u32,
+        refinement: u32,
+        refinement_step: f32,
         distribution: FlakeDistribution,
         alpha: f32,
         projected: bool,
@@ -439,8 +441,10 @@ fn saved_structure(filename: &str) -> Result<ffi::SavedStructure> {
     guarded("structure_file", filename, || {
         let header = saved::header(Path::new(filename))?;
         Ok(ffi::SavedStructure {
-            width: header.map.0,
-            height: header.map.1,
+            width: header.origin.size.0,
+            height: header.origin.size.1,
+            refinement: header.origin.refinement.map_or(0, |r| r.refinement),
+            refinement_step: header.origin.refinement.map_or(0.0, |r| r.step as f32),
             distribution: distribution_to_ffi(header.distribution),
             alpha: header.alpha,
             projected: header.normalization == Normalization::Projected,
@@ -480,12 +484,11 @@ fn load(
         };
         let start = Instant::now();
         let saved = SavedMap::load(Path::new(filename), &flakes)?;
-        let refinement = match map {
-            Some(map) => saved.check_map(map)?,
-            None => None,
-        };
-        let size = map.map_or(saved.header().map, |map| (map.width(), map.height()));
-        let core = saved.with_filter(filter).into_brdf(masking(surface), map)?;
+        if let Some(map) = map {
+            saved.check_map(map)?;
+        }
+        let Origin { size, refinement, .. } = saved.header().origin;
+        let core = saved.with_filter(filter).into_brdf(masking(surface))?;
         Ok(Box::new(Brdf {
             core,
             map: size,

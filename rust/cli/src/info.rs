@@ -10,7 +10,7 @@ use glints::methods::Method;
 use glints::methods::compact::Header;
 use glints::methods::tensor;
 use glints::microfacet;
-use glints::normal_map::{Encoding, NormalMap};
+use glints::normal_map::{Encoding, NormalMap, SlopeCovariance};
 use serde_json::{Value, json};
 
 use crate::arguments::{
@@ -36,7 +36,8 @@ use crate::structures;
 /// * Structures: bins per side, memory and build time of the compact inverse bin map for flakes of each roughness; of an
 ///   interpolated map with its refinement, and how far apart normals of neighbouring refined texels are.
 ///
-/// Of a saved structure, its header is told: the map's size, the flakes it was made for, and memory.
+/// Of a saved structure, its header is told: its size, the map that it was made from, whether interpolated, with the
+/// covariance of its slopes and the checksum by which it is known again, the flakes, and memory.
 ///
 /// Example: glints info flakes.exr --alpha 0.0025,0.01
 #[derive(Args)]
@@ -116,10 +117,21 @@ fn saved(header: &Header, path: &Path) -> Value {
             Normalization::Projected => "projected",
             Normalization::Paper => "paper",
         },
+        "map": {
+            "width": header.origin.size.0,
+            "height": header.origin.size.1,
+            "checksum": format!("{:08x}", header.origin.checksum),
+            "slope_covariance": slopes_json(header.origin.slopes),
+            "refinement": refinement_json(header.origin.refinement),
+        },
         "texel_bytes": header.texel_bytes,
         "count_bytes": header.count_bytes,
         "file_bytes": header.file_bytes,
     })
+}
+
+fn slopes_json(slopes: SlopeCovariance) -> Value {
+    json!({ "uu": slopes.xx, "uv": slopes.xy, "vv": slopes.yy })
 }
 
 fn saved_tensor(header: &tensor::Header, path: &Path) -> Value {
@@ -159,7 +171,7 @@ fn describe(map: &NormalMap, path: &Path) -> Value {
             _ => "signed",
         },
         "mean_normal": mean.to_array(),
-        "slope_covariance": { "uu": slopes.xx, "uv": slopes.xy, "vv": slopes.yy },
+        "slope_covariance": slopes_json(slopes),
         "roughness": { "u": (2.0 * slopes.xx).sqrt(), "v": (2.0 * slopes.yy).sqrt() },
         "tilt_degrees": tilts(normals),
         "flat_texels": share(&|n| n.truncate().length() < FLAT_SINE),

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use clap::{Args, Subcommand};
+use glints::methods::compact::Origin;
 use serde_json::json;
 
 use crate::arguments::{FlakeArguments, InterpolationArguments, MapArguments, TensorOptions, refined};
@@ -138,6 +139,7 @@ fn ibm(arguments: &IbmArguments) -> Result<()> {
     arguments.interpolation.check()?;
     let map = arguments.map.load()?;
     let refinement = arguments.interpolation.refinement(&map, model)?;
+    let origin = Origin::new(&map, refinement);
     let map = match refined(&map, refinement)? {
         Cow::Owned(refined) => refined,
         Cow::Borrowed(_) => map,
@@ -149,7 +151,7 @@ fn ibm(arguments: &IbmArguments) -> Result<()> {
     drop(map);
     output::write_files(&[&destination], |files| {
         let _progress = Progress::spinner("saving the structure");
-        structures::save(&structure, &files[0])
+        structures::save(&structure, &origin, &files[0])
     })?;
     let bytes = std::fs::metadata(destination.path()).map_or(0, |file| file.len());
     output::print(&format!(

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glints::flakes::FlakeModel;
 use glints::methods::Method;
-use glints::methods::compact::{self, CompactBinMap, Header};
+use glints::methods::compact::{self, CompactBinMap, Header, Origin};
 use glints::methods::inverse_bin_map::{InverseBinMap, Options};
 use glints::methods::tensor::{self, Tensor};
 use glints::normal_map::NormalMap;
@@ -38,9 +38,9 @@ pub fn tensor(
     Ok(Tensor::new(map, model, options, &shown)?)
 }
 
-/// Writes a structure to a file.
-pub fn save(structure: &Structure, path: &Path) -> Result<()> {
-    Ok(structure.save(path)?)
+/// Writes a structure to a file, with what it was made from.
+pub fn save(structure: &Structure, origin: &Origin, path: &Path) -> Result<()> {
+    Ok(structure.save(origin, path)?)
 }
 
 /// Loads a structure that was made for these flakes.

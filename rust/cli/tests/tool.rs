@@ -271,6 +271,15 @@ fn a_saved_structure_tells_what_it_is() {
     let header = json(folder.path(), &["info", "flakes.glints", "--json"]);
     assert_eq!(header["width"], 128);
     assert_eq!(header["alpha"], 0.004);
+    let map = json(
+        folder.path(),
+        &["info", "flakes.exr", "--json", "--alpha", "0.16"],
+    );
+    assert_eq!(header["map"]["slope_covariance"], map["slope_covariance"]);
+    assert_eq!(header["map"]["width"], 128);
+    assert!(header["map"]["refinement"].is_null());
+    let checksum = header["map"]["checksum"].as_str().unwrap();
+    assert!(checksum.len() == 8 && text.contains(checksum), "{text}");
     let path = folder.path().join("flakes.glints");
     let bytes = std::fs::read(&path).unwrap();
     assert_eq!(header["file_bytes"], bytes.len());
@@ -428,10 +437,24 @@ fn interpolated_maps_are_the_surface_of_curved_elements() {
         "4",
     ];
     succeeds(folder.path(), &[&precompute[..], bilinear].concat());
+    let header = json(folder.path(), &["info", "flakes.glints", "--json"]);
+    assert_eq!(header["width"], 64);
+    assert_eq!(header["map"]["width"], 16);
+    assert_eq!(header["map"]["refinement"]["texels_per_side"], 4);
+    // Of the map, not of its refined texels.
     assert_eq!(
-        json(folder.path(), &["info", "flakes.glints", "--json"])["width"],
-        64
+        header["map"]["slope_covariance"],
+        told(&["--alpha", "0.16"])["slope_covariance"]
     );
+    let text = succeeds(folder.path(), &["info", "flakes.glints"]);
+    for word in [
+        "64 x 64 texels",
+        "16 x 16 texels",
+        "interpolated, 4 x 4",
+        "slope covariance",
+    ] {
+        assert!(text.contains(word), "{word:?} is not in {text}");
+    }
     // A step that no refinement resolves is told, once, and the result is there.
     let output = glints(
         folder.path(),

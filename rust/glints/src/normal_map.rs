@@ -251,6 +251,19 @@ impl NormalMap {
     pub fn slope_covariance(&self) -> SlopeCovariance {
         slope_covariance(&self.normals)
     }
+
+    /// CRC-32 of the unit normals, row by row: x, y and z of each as single-precision numbers, little-endian. It tells maps
+    /// of one size apart, bit for bit.
+    pub fn checksum(&self) -> u32 {
+        let mut sum = crc32fast::Hasher::new();
+        let mut row = Vec::new();
+        for normals in self.normals.chunks_exact(self.width as usize) {
+            row.clear();
+            row.extend(normals.iter().map(|n| n.to_array().map(|c| c.to_bits().to_le())));
+            sum.update(bytemuck::cast_slice(&row));
+        }
+        sum.finalize()
+    }
 }
 
 /// The unit normal over a point of the unit disk.

@@ -2,36 +2,24 @@
 //!
 //! A renderer that is handed the file of `glints precompute ibm` maps it into memory and builds nothing. The file stands
 //! for the map, the flakes and the interpolation, so whatever else a scene says about them must agree with it:
-//! [`SavedMap::load`] compares the flakes, [`SavedMap::check_map`] the map.
+//! [`SavedMap::load`] compares the flakes, [`SavedMap::check_map`] the map, by a checksum of its normals. That is bit for bit:
+//! the same picture in another encoding, or decoded by a library that rounds differently, is another map.
 //!
-//! **Shadowing of the whole map** `G_x` needs the covariance of the map's slopes, for which the file has no field. Without
-//! the map it is that of the normals in the file, quantised to a twentieth of a lobe's standard deviation; those of an
-//! interpolated map are the refined texels', whose slopes vary less than the map's. With the map it is the map's own, and
-//! answers are bit for bit those of a structure that was built.
+//! **Shadowing of the whole map** `G_x` is made of the covariance of the map's slopes, which the file has: answers are those of a
+//! structure that was built, bit for bit, with the map and without.
 
 use std::path::{Path, PathBuf};
-
-use glam::DVec2;
-use rayon::prelude::*;
 
 use crate::brdf::{Brdf, Masking};
 use crate::error::{Error, Result};
 use crate::flakes::Normalization;
 use crate::footprint_filter::FootprintFilter;
 use crate::methods::compact::{CompactBinMap, Header, read_header};
-use crate::microfacet::{Distribution, Flake};
-use crate::normal_map::{NormalMap, SlopeCovariance};
-use crate::refinement::{MAX_REFINEMENT, Refinement};
+use crate::microfacet::Distribution;
+use crate::normal_map::NormalMap;
 
 /// Name of the parameter that names the file, in messages.
 const PARAMETER: &str = "structure_file";
-
-/// Most distance on the projected hemisphere between a normal of a map and the one in a file made from it, in standard
-/// deviations of a flake's lobe: twice the quantisation where 32 bits suffice.
-const LARGEST_DISTANCE: f32 = 0.1;
-
-/// The same where they do not, at the sharpest flakes.
-const LEAST_DISTANCE: f32 = 5e-4;
 
 /// What a structure was made for, besides the map.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -116,9 +104,8 @@ impl SavedMap {
     /// # Errors
     /// The file is missing, damaged, of another version or no saved structure; it was made for other `flakes`.
     pub fn load(path: &Path, flakes: &Flakes) -> Result<Self> {
-        let header = header(path)?;
+        let (structure, header) = CompactBinMap::load(path).map_err(named)?;
         flakes.check(path, &header)?;
-        let structure = CompactBinMap::load(path).map_err(named)?;
         Ok(Self {
             path: path.into(),
             header,
@@ -126,92 +113,39 @@ impl SavedMap {
         })
     }
 
-    /// How `map`, from which the structure was made, was interpolated; `None` where it was not.
+    /// Compares `map` with the one that the structure was made from.
     ///
     /// # Errors
-    /// The sizes do not fit, or a normal in the file is not that of the map, interpolated if the file has more texels.
-    pub fn check_map(&self, map: &NormalMap) -> Result<Option<Refinement>> {
-        let refinement = self.refinement(map)?;
-        let refined;
-        let expected = match refinement {
-            1 => map,
-            _ => {
-                refined = map.refined(refinement)?;
-                &refined
-            }
-        };
-        let limit = (LARGEST_DISTANCE * self.header.alpha / std::f32::consts::SQRT_2).max(LEAST_DISTANCE);
-        let is_other = |row: u32, column: u32| {
-            let [asked, found] = [expected.normal(column, row), self.structure.normal(column, row)];
-            asked.truncate().distance(found.truncate()) > limit
-        };
-        let (columns, rows) = self.header.map;
-        let other = (0..rows).into_par_iter().find_map_first(|row| {
-            (0..columns)
-                .find(|&column| is_other(row, column))
-                .map(|column| (column, row))
-        });
-        match other {
-            None if refinement == 1 => Ok(None),
-            None => {
-                let flake = Flake::new(self.header.distribution, self.header.alpha)?;
-                Refinement::new(map, Some(flake), refinement).map(Some)
-            }
-            Some((column, row)) => Err(self.other_map(
-                map,
-                &format!("its normal at column {column}, row {row} is another one than in the file"),
-            )),
+    /// It has another size, or other normals.
+    pub fn check_map(&self, map: &NormalMap) -> Result<()> {
+        let origin = &self.header.origin;
+        let (columns, rows) = origin.size;
+        if (map.width(), map.height()) != origin.size {
+            let sizes = format!(
+                "it has {} x {} texels, that map {columns} x {rows}",
+                map.width(),
+                map.height()
+            );
+            return Err(self.other_map(map, &sizes));
         }
-    }
-
-    fn refinement(&self, map: &NormalMap) -> Result<u32> {
-        let (columns, rows) = self.header.map;
-        let refinement = columns / map.width();
-        let sides = [map.width(), map.height()].map(|side| side.checked_mul(refinement));
-        if (1..=MAX_REFINEMENT).contains(&refinement) && sides == [Some(columns), Some(rows)] {
-            return Ok(refinement);
+        let found = map.checksum();
+        if found != origin.checksum {
+            let sums = format!(
+                "its normals have the checksum {found:08x}, those of that map {:08x}",
+                origin.checksum
+            );
+            return Err(self.other_map(map, &sums));
         }
-        let sizes = format!(
-            "it has {} x {} texels, the file {columns} x {rows}",
-            map.width(),
-            map.height()
-        );
-        Err(self.other_map(map, &sizes))
+        Ok(())
     }
 
     fn other_map(&self, map: &NormalMap, how: &str) -> Error {
         let reason = format!(
-            "is not the map that {PARAMETER} \"{}\" was made from: {how}; give that map with its encoding, leave \
-             filename out, or make another file with `glints precompute ibm`",
+            "is not the map that {PARAMETER} \"{}\" was made from: {how}; give that map with its encoding and flip_y, \
+             leave filename out, or make another file with `glints precompute ibm`",
             self.path.display()
         );
         Error::parameter("filename", map.name(), reason)
-    }
-
-    /// Covariance of the slopes of the normals in the file.
-    fn slope_covariance(&self) -> SlopeCovariance {
-        let (columns, rows) = self.header.map;
-        let slopes = |row: u32| {
-            (0..columns).map(move |column| {
-                let n = self.structure.normal(column, row).as_dvec3();
-                -n.truncate() / n.z
-            })
-        };
-        let count = f64::from(columns) * f64::from(rows);
-        // Sums of rows are added up in their order, so that the answer does not depend on the number of threads.
-        let sums: Vec<DVec2> = (0..rows).into_par_iter().map(|row| slopes(row).sum()).collect();
-        let mean = sums.into_iter().sum::<DVec2>() / count;
-        let squares: Vec<[f64; 3]> = (0..rows)
-            .into_par_iter()
-            .map(|row| {
-                slopes(row).fold([0.0; 3], |[xx, xy, yy], slope| {
-                    let d = slope - mean;
-                    [xx + d.x * d.x, xy + d.x * d.y, yy + d.y * d.y]
-                })
-            })
-            .collect();
-        let [xx, xy, yy] = [0, 1, 2].map(|k| squares.iter().map(|row| row[k]).sum::<f64>() / count);
-        SlopeCovariance { xx, xy, yy }
     }
 
     /// What the file is for.
@@ -219,18 +153,16 @@ impl SavedMap {
         &self.header
     }
 
-    /// The BRDF over the structure; `map`, which has been checked, gives the slopes instead of the file.
+    /// The BRDF over the structure.
     ///
     /// # Errors
     /// An explicit roughness of the masking that is none.
-    pub fn into_brdf(self, masking: Masking, map: Option<&NormalMap>) -> Result<Brdf> {
-        let slopes = match (masking, map) {
-            (Masking::Beckmann, Some(map)) => map.slope_covariance(),
-            (Masking::Beckmann, None) => self.slope_covariance(),
-            // Not asked for.
-            _ => SlopeCovariance::default(),
-        };
-        Brdf::with_slopes(|| slopes, masking, || Ok(Box::new(self.structure)))
+    pub fn into_brdf(self, masking: Masking) -> Result<Brdf> {
+        Brdf::with_slopes(
+            || self.header.origin.slopes,
+            masking,
+            || Ok(Box::new(self.structure)),
+        )
     }
 
     /// The same, seen through `filter`; a file knows none, and has the pixel's box at first.
@@ -261,7 +193,9 @@ fn named(error: Error) -> Error {
 mod tests {
     use super::*;
     use crate::flakes::FlakeModel;
-    use approx::assert_relative_eq;
+    use crate::methods::compact::Origin;
+    use crate::microfacet::Flake;
+    use crate::refinement::Refinement;
     use glam::Vec3;
 
     const FLAKES: Flakes = Flakes {
@@ -277,15 +211,19 @@ mod tests {
         NormalMap::from_normals("wavy", 48, 32, &normals).unwrap()
     }
 
-    /// The structure of a map, saved and loaded; the file is gone afterwards.
-    fn saved(map: &NormalMap) -> SavedMap {
+    /// The structure of a map, interpolated to `refinement` texels for each if that is not 0; the file is gone afterwards.
+    fn saved(map: &NormalMap, refinement: u32) -> SavedMap {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.glints");
+        let flake = Flake::new(FLAKES.distribution, FLAKES.alpha).unwrap();
         let model = FlakeModel {
-            flake: Flake::new(FLAKES.distribution, FLAKES.alpha).unwrap(),
+            flake,
             normalization: FLAKES.normalization,
         };
-        CompactBinMap::new(map, model).save(&path).unwrap();
+        let interpolated = (refinement > 0).then(|| Refinement::new(map, Some(flake), refinement).unwrap());
+        CompactBinMap::new(&map.refined(refinement.max(1)).unwrap(), model)
+            .save(&Origin::new(map, interpolated), &path)
+            .unwrap();
         let other = Flakes {
             alpha: 0.03,
             ..FLAKES
@@ -299,31 +237,31 @@ mod tests {
     }
 
     #[test]
-    fn slopes_of_the_file_are_those_of_the_map() {
+    fn slopes_are_those_of_the_map_whatever_the_interpolation() {
         let map = wavy_map();
-        let (found, expected) = (saved(&map).slope_covariance(), map.slope_covariance());
-        assert_relative_eq!(found.xx, expected.xx, max_relative = 1e-3);
-        assert_relative_eq!(found.yy, expected.yy, max_relative = 1e-3);
-        assert!((found.xy - expected.xy).abs() < 1e-3 * expected.xx);
+        let refined = map.refined(3).unwrap().slope_covariance();
+        for refinement in [0, 1, 3] {
+            let found = saved(&map, refinement).header().origin.slopes;
+            assert_eq!(found, map.slope_covariance());
+            assert!(found != refined);
+        }
     }
 
     #[test]
-    fn masking_is_that_of_the_map_where_there_is_one() {
+    fn masking_is_that_of_the_map() {
         let map = wavy_map();
-        let built = Brdf::with_slopes(
-            || map.slope_covariance(),
-            Masking::Beckmann,
-            || Ok(Box::new(saved(&map).into_structure())),
-        );
-        let alphas = |map| {
-            saved(&wavy_map())
-                .into_brdf(Masking::Beckmann, map)
-                .unwrap()
-                .masking_alphas()
-        };
-        assert_eq!(alphas(Some(&map)), built.unwrap().masking_alphas());
-        assert!(alphas(None) != alphas(Some(&map)));
-        let none = saved(&map).into_brdf(Masking::None, None).unwrap();
+        let alphas = |brdf: Result<Brdf>| brdf.unwrap().masking_alphas();
+        let expected = alphas(Brdf::new(&map, Masking::Beckmann, || {
+            Ok(Box::new(saved(&map, 0).into_structure()))
+        }));
+        assert!(expected.0 > 0.0 && expected.1 > 0.0 && expected.0 != expected.1);
+        for refinement in [0, 2] {
+            assert_eq!(
+                alphas(saved(&map, refinement).into_brdf(Masking::Beckmann)),
+                expected
+            );
+        }
+        let none = saved(&map, 0).into_brdf(Masking::None).unwrap();
         assert_eq!(none.masking_alphas(), (0.0, 0.0));
         assert_eq!(none.method().map_size(), (48, 32));
     }
@@ -331,16 +269,31 @@ mod tests {
     #[test]
     fn only_the_map_of_the_file_passes() {
         let map = wavy_map();
-        assert_eq!(saved(&map).check_map(&map).unwrap(), None);
-        let refined = saved(&map.refined(3).unwrap());
-        assert_eq!(refined.check_map(&map).unwrap().unwrap().refinement, 3);
+        for refinement in [0, 1, 3] {
+            let saved = saved(&map, refinement);
+            saved.check_map(&map).unwrap();
+            let found = saved.header().origin.refinement;
+            assert_eq!(
+                found.map(|r| r.refinement),
+                (refinement > 0).then_some(refinement)
+            );
+        }
+        let refused = |map: &NormalMap| saved(&wavy_map(), 0).check_map(map).unwrap_err().to_string();
+        // Of the same size, with one other texel, which moves by less than the structure keeps.
         let mut normals = map.normals().to_vec();
-        normals[48 * 20 + 5] = Vec3::new(0.3, -0.3, 1.0);
+        normals[48 * 20 + 5].x += 1e-6;
         let other = NormalMap::from_normals("other", 48, 32, &normals).unwrap();
-        let refused = saved(&map).check_map(&other).unwrap_err().to_string();
-        assert!(refused.contains("column 5, row 20"), "{refused}");
+        let sums = [other.checksum(), map.checksum()].map(|sum| format!("{sum:08x}"));
+        for words in [
+            ["other", "map.glints"],
+            [&sums[0], &sums[1]],
+            ["encoding", "glints precompute"],
+        ] {
+            let refused = refused(&other);
+            assert!(words.iter().all(|word| refused.contains(word)), "{refused}");
+        }
         let turned = NormalMap::from_normals("turned", 32, 48, map.normals()).unwrap();
-        let refused = saved(&map).check_map(&turned).unwrap_err().to_string();
+        let refused = refused(&turned);
         assert!(
             refused.contains("32 x 48") && refused.contains("48 x 32"),
             "{refused}"

@@ -4,26 +4,23 @@
 //! that the checks behind them are what is tested. A panic is a failure; an abort or a signal ends the process and leaves
 //! the file that led to it.
 
+mod container;
+
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use container::{COUNTS, ENTRY, LENGTH, Random, seal, table, u32_at};
 use glam::Vec3;
+use glints::brdf::{Brdf, Masking};
 use glints::flakes::{FlakeModel, Normalization};
 use glints::footprint::Footprint;
 use glints::half_vector::DirectionPair;
 use glints::methods::Method;
-use glints::methods::compact::{CompactBinMap, read_header};
+use glints::methods::compact::{CompactBinMap, Origin, read_header};
 use glints::microfacet::{Distribution, Flake};
 use glints::normal_map::NormalMap;
-
-/// Where the fields of the format are that mutations aim at; see the module `file` of the compact inverse bin map.
-const HEADER_SUM: usize = 16;
-const BODY_SUM: usize = 20;
-const LENGTH: usize = 24;
-const SECTIONS: usize = 108;
-const TABLE: usize = 112;
-const ENTRY: usize = 24;
+use glints::refinement::Refinement;
 
 /// What a run did.
 #[derive(Debug, Default)]
@@ -43,7 +40,7 @@ pub fn run(seed: u64, time: Duration, folder: &Path) -> Outcome {
     let mut outcome = Outcome::default();
     while start.elapsed() < time {
         let execution = outcome.executions;
-        let mut random = Random::new(seed ^ execution.wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        let mut random = Random(seed ^ execution.wrapping_mul(0x9e37_79b9_7f4a_7c15));
         let mut bytes = random.pick(&valid).clone();
         random.mutate(&mut bytes);
         std::fs::write(&path, &bytes).expect("the folder is writable");
@@ -72,8 +69,8 @@ fn attempt(path: &Path, random: &mut Random) -> Attempt {
     if let Ok(header) = read_header(path) {
         assert!(!header.to_string().is_empty());
     }
-    let structure = match CompactBinMap::load(path) {
-        Ok(structure) => structure,
+    let (structure, header) = match CompactBinMap::load(path) {
+        Ok(loaded) => loaded,
         Err(error) => {
             assert!(error.to_string().contains("mutated.glints"));
             return Attempt::Refused;
@@ -109,6 +106,19 @@ fn attempt(path: &Path, random: &mut Random) -> Attempt {
         let texel = (random.below(width as usize), random.below(height as usize));
         is_number &= structure.normal(texel.0 as u32, texel.1 as u32).is_finite();
     }
+    // With shadowing by the slopes in the file.
+    let slopes = || header.origin.slopes;
+    let masked = Brdf::with_slopes(slopes, Masking::Beckmann, || Ok(Box::new(structure)));
+    let masked = masked.expect("nothing is refused");
+    for _ in 0..8 {
+        let mut near =
+            || Vec3::new(random.real() - 0.5, random.real() - 0.5, 0.02 + random.real()).normalize();
+        let (wi, wo) = (near(), near());
+        let edges = [0.1, 0.01].map(|size| [size * random.real(), size * random.real()]);
+        let footprint = masked.footprint([random.real(), random.real()], edges[0], edges[1]);
+        let answer = masked.evaluate(&footprint, wi, wo);
+        is_number &= answer.value.is_finite() && answer.pdf.is_finite();
+    }
     if is_number {
         Attempt::Answered
     } else {
@@ -116,24 +126,26 @@ fn attempt(path: &Path, random: &mut Random) -> Attempt {
     }
 }
 
-/// Saved structures of several shapes: both ways of storing texels, with and without counts, with incomplete blocks.
+/// Saved structures of several shapes: both ways of storing texels, with and without counts, with incomplete blocks, of
+/// interpolated maps.
 fn valid_files(folder: &Path) -> Vec<Vec<u8>> {
+    // Columns and rows, roughness, slopes, and texels for each if the map is interpolated.
     let shapes = [
-        (1, 1, 0.02, 0.3),
-        (37, 23, 0.2, 0.5),
-        (64, 64, 0.05, 1.5),
-        (150, 70, 0.004, 0.5),
-        (128, 128, 0.003, 0.1),
-        (300, 40, 0.01, 1.0),
-        (200, 300, 0.02, 0.8),
-        (90, 260, 0.0003, 0.7),
+        (1, 1, 0.02, 0.3, None),
+        (37, 23, 0.2, 0.5, Some(2)),
+        (64, 64, 0.05, 1.5, None),
+        (150, 70, 0.004, 0.5, None),
+        (128, 128, 0.003, 0.1, None),
+        (300, 40, 0.01, 1.0, Some(1)),
+        (200, 300, 0.02, 0.8, None),
+        (90, 260, 0.0003, 0.7, None),
     ];
     let path = folder.join("valid.glints");
     shapes
         .into_iter()
         .enumerate()
-        .map(|(index, (width, height, alpha, slope))| {
-            let mut random = Random::new(index as u64);
+        .map(|(index, (width, height, alpha, slope, refinement))| {
+            let mut random = Random(index as u64);
             let mut component = || slope * (2.0 * random.real() - 1.0);
             let normals: Vec<Vec3> = (0..width * height)
                 .map(|_| Vec3::new(component(), component(), 1.0))
@@ -144,39 +156,18 @@ fn valid_files(folder: &Path) -> Vec<Vec<u8>> {
                 flake: Flake::new(distribution, alpha).expect("a roughness"),
                 normalization: [Normalization::Projected, Normalization::Paper][index / 2 % 2],
             };
-            let structure = CompactBinMap::new(&map, model);
-            structure.save(&path).expect("the folder is writable");
+            let refined = map.refined(refinement.unwrap_or(1)).expect("a map");
+            let refinement =
+                refinement.map(|r| Refinement::new(&map, Some(model.flake), r).expect("a refinement"));
+            CompactBinMap::new(&refined, model)
+                .save(&Origin::new(&map, refinement), &path)
+                .expect("the folder is writable");
             std::fs::read(&path).expect("a saved file")
         })
         .collect()
 }
 
-/// SplitMix64, Steele et al. 2014.
-struct Random(u64);
-
 impl Random {
-    fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    /// Below `end`, which is not zero.
-    fn below(&mut self, end: usize) -> usize {
-        (self.next() % end as u64) as usize
-    }
-
-    /// In `[0, 1)`.
-    fn real(&mut self) -> f32 {
-        (self.next() >> 40) as f32 / (1 << 24) as f32
-    }
-
     fn pick<'a, T>(&mut self, items: &'a [T]) -> &'a T {
         &items[self.below(items.len())]
     }
@@ -212,7 +203,7 @@ impl Random {
                 .pick(&[f32::NAN, f32::INFINITY, -1.0, 1e-30, 1e30, 1e-7])
                 .to_bits(),
             6 => old ^ (1 << self.below(32)),
-            _ => self.next() as u32,
+            _ => self.bits() as u32,
         }
     }
 
@@ -225,25 +216,31 @@ impl Random {
 
     /// Sets a field of the header.
     fn set_field(&mut self, bytes: &mut [u8]) {
+        let [fields_end, _] = table(bytes);
         let at = match self.below(8) {
-            0 => self.below(TABLE),
-            _ => 32 + 4 * self.below((TABLE - 32) / 4),
+            0 => self.below(fields_end),
+            _ => COUNTS + 4 * self.below((fields_end - COUNTS) / 4),
         };
         self.set_word(bytes, at);
     }
 
     /// Sets a field of the table of sections, or swaps two sections.
     fn set_table(&mut self, bytes: &mut [u8]) {
-        let sections = field(bytes, SECTIONS).unwrap_or(0).clamp(1, 32) as usize;
-        let (a, b) = (self.below(sections), self.below(sections));
-        if a != b && self.below(4) == 0 && bytes.len() >= TABLE + ENTRY * sections {
+        let (a, b) = (self.entry(bytes), self.entry(bytes));
+        if a != b && self.below(4) == 0 && bytes.len() >= a.max(b) + ENTRY {
             for k in 0..ENTRY {
-                bytes.swap(TABLE + ENTRY * a + k, TABLE + ENTRY * b + k);
+                bytes.swap(a + k, b + k);
             }
         } else {
-            let at = TABLE + ENTRY * a + 4 * self.below(ENTRY / 4);
+            let at = a + 4 * self.below(ENTRY / 4);
             self.set_word(bytes, at);
         }
+    }
+
+    /// Where an entry of the table of sections is.
+    fn entry(&mut self, bytes: &[u8]) -> usize {
+        let [start, end] = table(bytes);
+        start + ENTRY * self.below((end - start) / ENTRY)
     }
 
     /// Cuts bytes off the end, or adds some.
@@ -253,7 +250,7 @@ impl Random {
             1 => bytes.len() + self.below(200),
             _ => bytes.len().saturating_sub(1 + self.below(200)),
         };
-        bytes.resize(length, self.next() as u8);
+        bytes.resize(length, self.bits() as u8);
         // Mostly, the field for the length follows.
         if let Some(place) = bytes.get_mut(LENGTH..LENGTH + 8).filter(|_| self.below(8) > 0) {
             place.copy_from_slice(&(length as u64).to_le_bytes());
@@ -270,9 +267,8 @@ impl Random {
 
     /// Sets a bit, a byte or a number anywhere in one of the sections, small or large alike.
     fn set_body(&mut self, bytes: &mut [u8]) {
-        let sections = field(bytes, SECTIONS).unwrap_or(0).clamp(1, 32) as usize;
-        let entry = TABLE + ENTRY * self.below(sections);
-        let read = |at| field(bytes, at).unwrap_or(0) as usize;
+        let entry = self.entry(bytes);
+        let read = |at| u32_at(bytes, at) as usize;
         let (width, offset, count) = (read(entry + 4), read(entry + 8), read(entry + 16));
         let place = offset.wrapping_add(self.below(width.wrapping_mul(count).max(1)));
         let at = if place < bytes.len() {
@@ -291,22 +287,4 @@ impl Random {
             }
         }
     }
-}
-
-/// The number at a place of the file.
-fn field(bytes: &[u8], at: usize) -> Option<u32> {
-    Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?))
-}
-
-/// Makes both checksums right, where a file is long enough to have them.
-fn seal(bytes: &mut [u8]) {
-    let sections = field(bytes, SECTIONS).unwrap_or(0) as usize;
-    let table_end = TABLE + ENTRY * sections.min(1 << 20);
-    if table_end > bytes.len() {
-        return;
-    }
-    let body = crc32fast::hash(&bytes[table_end..]);
-    bytes[BODY_SUM..BODY_SUM + 4].copy_from_slice(&body.to_le_bytes());
-    let header = crc32fast::hash(&bytes[BODY_SUM..table_end]);
-    bytes[HEADER_SUM..HEADER_SUM + 4].copy_from_slice(&header.to_le_bytes());
 }

@@ -1,54 +1,52 @@
 //! Saving and loading: a structure is built once, and used in place by every later run.
 //!
-//! **Format**, version 3. Numbers are little-endian. The fixed fields:
+//! **Format**, version 4. A file is a [`container`](crate::container) with these fields, f32 and f64 as their bits, f64 with the
+//! lower half first:
 //!
-//! | offset | type | |
+//! | field | type | |
 //! |---|---|---|
-//! | 0 | 8 bytes | `\x89GLINTS\n`: neither text nor left alone by transfers that change ends of lines |
-//! | 8 | u32 | byte-order mark, `0x0a0b0c0d` |
-//! | 12 | u32 | version |
-//! | 16 | u32 | CRC-32 of the bytes from 20 to the end of the table |
-//! | 20 | u32 | CRC-32 of what follows the table |
-//! | 24 | u64 | bytes of the file |
-//! | 32 | 2 u32 | columns and rows of the map, 1 to 65535 |
-//! | 40 | f32 | roughness of a flake, as [`Flake`] takes it |
-//! | 44 | u32 | its distribution: 0 Beckmann, 1 GGX |
-//! | 48 | u32 | normalization: 0 projected area, 1 as in the paper |
-//! | 52 | u32 | texels: 0 in [`super::tiles`], 1 in [`super::blocks`] |
-//! | 56 | 2 u32 | of blocks, s and r; of tiles, zero |
-//! | 64 | 3 f32, 2 u32 | grid of the quantised normals: corner, pitch, columns and rows |
-//! | 84 | 3 f32, 2 u32 | bins of the counts, likewise |
-//! | 104 | u32 | finest level with counts; the number of levels if none has |
-//! | 108 | u32 | number of sections |
+//! | 0 | 2 u32 | columns and rows of texels, 1 to 65535 |
+//! | 2 | f32 | roughness of a flake, as [`Flake`] takes it |
+//! | 3 | u32 | its distribution: 0 Beckmann, 1 GGX |
+//! | 4 | u32 | normalization: 0 projected area, 1 as in the paper |
+//! | 5 | u32 | texels: 0 in [`super::tiles`], 1 in [`super::blocks`] |
+//! | 6 | 2 u32 | of blocks, s and r; of tiles, zero |
+//! | 8 | 3 f32, 2 u32 | grid of the quantised normals: corner, pitch, columns and rows |
+//! | 13 | 3 f32, 2 u32 | bins of the counts, likewise |
+//! | 18 | u32 | finest level with counts; the number of levels if none has |
+//! | 19 | u32 | interpolation of the map that it was made from: 0 none, 1 bilinear |
+//! | 20 | u32 | texels for each texel and side of that map, 1 to 8; without interpolation 1 |
+//! | 21 | f32 | step between their normals, see [`Refinement::step`]; without interpolation 0 |
+//! | 22 | 3 f64 | covariance of that map's slopes: uu, uv, vv |
+//! | 28 | u32 | [`NormalMap::checksum`] of that map |
 //!
-//! The table has 24 bytes for each section: kind (u32), bytes of an element (u32), offset (u64) and number of elements
-//! (u64). Sections stand in the order of their kinds, each at the next multiple of 64 bytes; the file ends with the last.
+//! and sections, in this order:
 //!
-//! | kind | elements | |
-//! |---|---|---|
-//! | 0 | u32 | packed words of blocks, or tiles |
-//! | 1 | 3 u32 | blocks: extents of the rows of cells |
-//! | 2 | u32 | blocks: where the rows of cells begin |
-//! | 3 | u16 or u32 | blocks: where the cells begin |
-//! | 4 | u16 | blocks: pointers of the permutations, each the number of another |
-//! | 16 + level | u8, u16 or u32 | counts of a level, with its padding |
+//! | elements | |
+//! |---|---|
+//! | u32 | packed words of blocks, or tiles |
+//! | 3 u32 | blocks: extents of the rows of cells |
+//! | u32 | blocks: where the rows of cells begin |
+//! | u16 or u32 | blocks: where the cells begin |
+//! | u16 | blocks: pointers of the permutations, each the number of another |
+//! | u8, u16 or u32 | for each level that has them, from the finest on: counts, with their padding |
 //!
-//! Whatever changes these arrays, or a constant that queries of them rely on, takes another version.
+//! Whatever changes these arrays, or a constant that queries of them rely on, takes another version. Versions up to 3 had
+//! a head of their own, with the number of the version at the same place, so that they are told apart and refused.
+//!
+//! **The map** Fields from 19 on are what a renderer needs of the map when it has only the file: the slopes for shadowing, the map's
+//! own, not those of quantised or refined normals; and by what the map is known again.
 //!
 //! **Loading** maps the file into memory, and reads all of it once, at about 8 GB/s once it is in the page cache (65 MB of a
 //! 4096 x 4096 map in 8 ms, where building takes 1.8 s): for the checksum, which finds damage, and for [`super::check`],
-//! which makes sure that no query can leave an array, whoever wrote the file. Every size is derived from the fixed fields
-//! and compared with the table.
+//! which makes sure that no query can leave an array, whoever wrote the file. Every size is derived from the fields and
+//! compared with the table.
 
 use std::fmt;
-use std::fs::File;
-use std::io::{self, Read, Write};
+use std::ops::Range;
 use std::path::Path;
-use std::sync::Arc;
 
-use bytemuck::Pod;
 use glam::Vec2;
-use memmap2::Mmap;
 
 use super::blocks::{Blocks, Geometry, Offsets, Parts};
 use super::check;
@@ -57,41 +55,59 @@ use super::cover::Tree;
 use super::grid::Grid;
 use super::tiles::Tiles;
 use super::{CompactBinMap, LEAF_BITS, Texels};
-use crate::array::Array;
-use crate::container::temporary_beside;
+use crate::container::{Checked, Contents, Head, Kind, Section};
 use crate::error::{Error, Result};
 use crate::flakes::{FlakeModel, Normalization};
 use crate::microfacet::{Distribution, Flake};
+use crate::normal_map::{MIN_Z, NormalMap, SlopeCovariance};
+use crate::refinement::{MAX_REFINEMENT, Refinement};
 
 /// The version that is written, and the only one that is read.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
-const MAGIC: [u8; 8] = *b"\x89GLINTS\n";
-const BYTE_ORDER: u32 = 0x0a0b_0c0d;
+const KIND: Kind = Kind {
+    magic: *b"\x89GLINTS\n",
+    version: VERSION,
+    made_by: "glints precompute ibm",
+};
 
-/// Where the first checksum's bytes begin, and the table.
-const CHECKED: usize = 20;
-const TABLE: usize = 112;
+/// The map that a structure was made from, as far as a renderer needs it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Origin {
+    /// Columns and rows of the map.
+    pub size: (u32, u32),
+    /// How it was interpolated, if it was; the structure then has as many texels for each.
+    pub refinement: Option<Refinement>,
+    /// Covariance of its slopes.
+    pub slopes: SlopeCovariance,
+    /// [`NormalMap::checksum`].
+    pub checksum: u32,
+}
 
-/// Bytes of a section in the table, and most sections: five, and the levels of the largest map.
-const ENTRY: usize = 24;
-const MAX_SECTIONS: usize = 32;
+impl Origin {
+    /// `map` as it was before it was interpolated.
+    pub fn new(map: &NormalMap, refinement: Option<Refinement>) -> Self {
+        Self {
+            size: (map.width(), map.height()),
+            refinement,
+            slopes: map.slope_covariance(),
+            checksum: map.checksum(),
+        }
+    }
 
-const ALIGNMENT: u64 = 64;
-
-const WORDS: u32 = 0;
-const EXTENTS: u32 = 1;
-const ROWS: u32 = 2;
-const OFFSETS: u32 = 3;
-const POINTERS: u32 = 4;
-const COUNTS: u32 = 16;
+    /// Columns and rows of the structure.
+    fn texels(&self) -> (u64, u64) {
+        let refined = |side| u64::from(side) * u64::from(self.refinement.map_or(1, |r| r.refinement));
+        (refined(self.size.0), refined(self.size.1))
+    }
+}
 
 /// What a saved structure is for.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Header {
     /// Version of the format.
     pub version: u32,
-    /// Columns and rows of the map.
+    /// Columns and rows of the structure: of the map, or of its refined texels where it was interpolated.
     pub map: (u32, u32),
     /// Roughness of a flake.
     pub alpha: f32,
@@ -99,6 +115,9 @@ pub struct Header {
     pub distribution: Distribution,
     /// How texels are weighted.
     pub normalization: Normalization,
+    /// What it was made from. The file keeps the refinement's step in single precision, and not whether it was capped: who
+    /// made the file was told.
+    pub origin: Origin,
     /// Bytes of the quantised normals with what finds them.
     pub texel_bytes: u64,
     /// Bytes of the counts.
@@ -124,6 +143,25 @@ impl fmt::Display for Header {
             self.version
         )?;
         writeln!(f, "size              {} x {} texels", self.map.0, self.map.1)?;
+        let Origin {
+            size,
+            refinement,
+            slopes,
+            checksum,
+        } = self.origin;
+        write!(f, "map               {} x {} texels, ", size.0, size.1)?;
+        if let Some(Refinement { refinement, step, .. }) = refinement {
+            write!(
+                f,
+                "interpolated, {refinement} x {refinement} texels for each, {step:.2} standard deviations of a lobe apart, "
+            )?;
+        }
+        writeln!(f, "checksum {checksum:08x}")?;
+        writeln!(
+            f,
+            "slope covariance  uu {:.3e}, uv {:.3e}, vv {:.3e}",
+            slopes.xx, slopes.xy, slopes.yy
+        )?;
         writeln!(
             f,
             "flakes            alpha {}, {distribution}, weighted by {normalization}",
@@ -141,10 +179,7 @@ impl fmt::Display for Header {
 
 /// Whether a file begins as a saved structure does; whatever cannot be read does not.
 pub fn is_saved(path: &Path) -> bool {
-    let mut magic = [0; MAGIC.len()];
-    path.is_file()
-        && File::open(path).is_ok_and(|mut file| file.read_exact(&mut magic).is_ok())
-        && magic == MAGIC
+    KIND.is_of(path)
 }
 
 /// What a saved structure is for, from the beginning of the file; the rest is not looked at.
@@ -152,29 +187,35 @@ pub fn is_saved(path: &Path) -> bool {
 /// # Errors
 /// The file cannot be read, is no saved structure, has another version, or its header is damaged.
 pub fn read_header(path: &Path) -> Result<Header> {
-    let read = || -> std::result::Result<Header, String> {
-        let (file, length) = open(path)?;
-        let mut start = Vec::new();
-        file.take((TABLE + MAX_SECTIONS * ENTRY) as u64)
-            .read_to_end(&mut start)
-            .map_err(unreadable)?;
-        Ok(Preamble::parse(&start, length)?.header(length))
+    let read = || {
+        let head = KIND.read_head(path)?;
+        let fields = Fields::new(&head).map_err(|what| KIND.inconsistent(&what))?;
+        Ok(fields.header(&head))
     };
     read().map_err(|reason| refused(path, reason))
 }
 
 impl CompactBinMap {
-    /// Writes the structure: to a temporary file in the same folder, which then takes the name `path`. A file of that name
-    /// is replaced; who has it mapped keeps what was in it.
+    /// Writes the structure, made from the map `origin`: to a temporary file in the same folder, which then takes the name
+    /// `path`. A file of that name is replaced; who has it mapped keeps what was in it.
     ///
     /// # Errors
-    /// The file cannot be written; nothing is left of it.
-    pub fn save(&self, path: &Path) -> Result<()> {
-        self.write(path).map_err(|e| {
-            let reason =
-                format!("cannot be written ({e}); check the folder, its permissions and its free space");
-            refused(path, reason)
-        })
+    /// The file cannot be written; nothing is left of it. `origin` has another number of texels.
+    pub fn save(&self, origin: &Origin, path: &Path) -> Result<()> {
+        if origin.texels() != (self.map.0.into(), self.map.1.into()) {
+            let value = format!("{} x {} texels", origin.size.0, origin.size.1);
+            let reason = format!(
+                "is not the map that a structure of {} x {} was made from; give that one, and how it was interpolated",
+                self.map.0, self.map.1
+            );
+            return Err(Error::parameter("origin", value, reason));
+        }
+        KIND.write(path, &self.fields(origin), &self.sections())
+            .map_err(|e| {
+                let reason =
+                    format!("cannot be written ({e}); check the folder, its permissions and its free space");
+                refused(path, reason)
+            })
     }
 
     /// Maps a file of [`Self::save`] into memory. It answers bit for bit as the saved structure did. The file may be replaced
@@ -182,88 +223,44 @@ impl CompactBinMap {
     ///
     /// # Errors
     /// The file cannot be read, is no saved structure, has another version, is damaged, or its content is inconsistent.
-    pub fn load(path: &Path) -> Result<Self> {
+    pub fn load(path: &Path) -> Result<(Self, Header)> {
         let load = || {
-            let (file, length) = open(path)?;
-            // SAFETY: all values of the mapped types are valid, so that only a change of the bytes while they are
-            // borrowed could do harm. `save` never writes to a file that has its final name; others are told not to.
-            let file = Arc::new(unsafe { Mmap::map(&file) }.map_err(unreadable)?);
-            let preamble = Preamble::parse(&file, length)?;
-            preamble.check_sum(&file)?;
-            preamble.structure(&file)
+            let mut contents = KIND.read(path)?;
+            let checked = |contents: &mut Contents| {
+                let fields = Fields::new(&contents.head)?;
+                let header = fields.header(&contents.head);
+                Ok((fields.structure(contents)?, header))
+            };
+            checked(&mut contents).map_err(|what: String| KIND.inconsistent(&what))
         };
         load().map_err(|reason| refused(path, reason))
     }
 
-    fn write(&self, path: &Path) -> io::Result<()> {
-        let mut file = temporary_beside(path)?;
-        let sections = self.sections();
-        file.write_all(&self.preamble(&sections))?;
-        for_each_chunk(&sections, |bytes| file.write_all(bytes))?;
-        file.as_file().sync_all()?;
-        file.persist(path).map_err(|e| e.error)?;
-        Ok(())
-    }
-
     fn sections(&self) -> Vec<Section<'_>> {
         let mut sections = match &self.texels {
-            Texels::Tiles(tiles) => vec![Section::new(WORDS, tiles.units())],
+            Texels::Tiles(tiles) => vec![Section::new(tiles.units())],
             Texels::Blocks(blocks) => vec![
-                Section::new(WORDS, blocks.words.units()),
-                Section::new(EXTENTS, &blocks.extents),
-                Section::new(ROWS, &blocks.rows),
+                Section::new(blocks.words.units()),
+                Section::new(&blocks.extents),
+                Section::new(&blocks.rows),
                 match &blocks.offsets {
-                    Offsets::Narrow(offsets) => Section::new(OFFSETS, offsets),
-                    Offsets::Wide(offsets) => Section::new(OFFSETS, offsets),
+                    Offsets::Narrow(offsets) => Section::new(offsets),
+                    Offsets::Wide(offsets) => Section::new(offsets),
                 },
-                Section::new(POINTERS, &blocks.pointers),
+                Section::new(&blocks.pointers),
             ],
         };
-        for (index, level) in self.counts.levels().iter().enumerate() {
-            let kind = COUNTS + index as u32;
-            sections.extend(level.as_ref().map(|level| match level {
-                Level::U8(counts) => Section::new(kind, counts),
-                Level::U16(counts) => Section::new(kind, counts),
-                Level::U32(counts) => Section::new(kind, counts),
-            }));
-        }
+        let levels = self.counts.levels().iter().flatten();
+        sections.extend(levels.map(|level| match level {
+            Level::U8(counts) => Section::new(counts),
+            Level::U16(counts) => Section::new(counts),
+            Level::U32(counts) => Section::new(counts),
+        }));
         sections
     }
 
-    /// The fixed fields and the table.
-    fn preamble(&self, sections: &[Section]) -> Vec<u8> {
-        let table_end = TABLE + ENTRY * sections.len();
-        let mut table = Vec::new();
-        let mut end = table_end as u64;
-        for section in sections {
-            let offset = end.next_multiple_of(ALIGNMENT);
-            table.extend(section.kind.to_le_bytes());
-            table.extend((section.width as u32).to_le_bytes());
-            table.extend(offset.to_le_bytes());
-            table.extend(((section.bytes.len() / section.width) as u64).to_le_bytes());
-            end = offset + section.bytes.len() as u64;
-        }
-        let mut sum = crc32fast::Hasher::new();
-        let Ok(()) = for_each_chunk(sections, |bytes| {
-            sum.update(bytes);
-            Ok::<_, std::convert::Infallible>(())
-        });
-        let mut checked = sum.finalize().to_le_bytes().to_vec();
-        checked.extend(end.to_le_bytes());
-        checked.extend(self.fields(sections.len()));
-        checked.extend(table);
-
-        let mut bytes = MAGIC.to_vec();
-        for number in [BYTE_ORDER, VERSION, crc32fast::hash(&checked)] {
-            bytes.extend(number.to_le_bytes());
-        }
-        bytes.extend(checked);
-        bytes
-    }
-
-    /// The fixed fields from the map's size on.
-    fn fields(&self, sections: usize) -> Vec<u8> {
-        let (texels, side_bits, cell_bits, grid) = match &self.texels {
+    fn fields(&self, origin: &Origin) -> Vec<u32> {
+        let (layout, side_bits, cell_bits, grid) = match &self.texels {
             Texels::Tiles(tiles) => (0, 0, 0, tiles.grid()),
             Texels::Blocks(blocks) => {
                 let geometry = blocks.geometry();
@@ -284,66 +281,33 @@ impl CompactBinMap {
         };
         let levels = self.counts.levels();
         let finest = levels.iter().position(Option::is_some).unwrap_or(levels.len());
+        let (interpolation, refinement, step) = match origin.refinement {
+            None => (0, 1, 0.0),
+            Some(r) => (1, r.refinement, r.step as f32),
+        };
+        let SlopeCovariance { xx, xy, yy } = origin.slopes;
+        let halves = |value: f64| [value.to_bits() as u32, (value.to_bits() >> 32) as u32];
+
         let mut fields = vec![self.map.0, self.map.1, self.model.flake.alpha().to_bits()];
-        fields.extend([distribution, normalization, texels, side_bits, cell_bits]);
+        fields.extend([distribution, normalization, layout, side_bits, cell_bits]);
         fields.extend(grid_fields(grid));
         fields.extend(grid_fields(self.counts.bins()));
-        fields.extend([finest as u32, sections as u32]);
-        fields.into_iter().flat_map(u32::to_le_bytes).collect()
+        fields.extend([finest as u32, interpolation, refinement, step.to_bits()]);
+        fields.extend([xx, xy, yy].into_iter().flat_map(halves));
+        fields.push(origin.checksum);
+        fields
     }
 }
 
-/// An array to be written.
-struct Section<'a> {
-    kind: u32,
-    /// Bytes of an element.
-    width: usize,
-    bytes: &'a [u8],
-}
-
-impl<'a> Section<'a> {
-    fn new<T: Pod>(kind: u32, array: &'a Array<T>) -> Self {
-        Self {
-            kind,
-            width: size_of::<T>(),
-            bytes: bytemuck::cast_slice(array),
-        }
-    }
-}
-
-/// Calls `visit` with all that follows the table.
-fn for_each_chunk<E>(
-    sections: &[Section],
-    mut visit: impl FnMut(&[u8]) -> std::result::Result<(), E>,
-) -> std::result::Result<(), E> {
-    let mut end = TABLE + ENTRY * sections.len();
-    for section in sections {
-        let start = end.next_multiple_of(ALIGNMENT as usize);
-        visit(&[0; ALIGNMENT as usize][..start - end])?;
-        visit(section.bytes)?;
-        end = start + section.bytes.len();
-    }
-    Ok(())
-}
-
-/// A section of the table.
-#[derive(Clone, Copy)]
-struct Entry {
-    kind: u32,
-    width: u32,
-    offset: u64,
-    count: u64,
-}
-
-/// The fixed fields and the table, each field in its domain, the sections inside the file.
-struct Preamble {
+/// The fields, each in its domain, of a file with as many sections as they ask for.
+struct Fields {
     map: (u32, u32),
     model: FlakeModel,
     layout: Layout,
     bins: Grid,
+    tree: Tree,
     finest: usize,
-    body_sum: u32,
-    table: Vec<Entry>,
+    origin: Origin,
 }
 
 /// How texels are stored.
@@ -352,183 +316,150 @@ enum Layout {
     Blocks(Geometry),
 }
 
-/// Why a file is refused: what is wrong, and what to do.
-type Checked<T> = std::result::Result<T, String>;
-
-impl Preamble {
-    /// Reads the beginning of a file of `length` bytes.
-    fn parse(start: &[u8], length: u64) -> Checked<Self> {
-        if !start.starts_with(&MAGIC) {
-            return Err("is not a saved structure; give a file that `glints precompute` made".into());
+impl Layout {
+    /// Number of sections.
+    fn sections(&self) -> usize {
+        match self {
+            Self::Tiles(_) => 1,
+            Self::Blocks(_) => 5,
         }
-        let mut fields = Fields(&start[MAGIC.len()..]);
-        if fields.u32()? != BYTE_ORDER || cfg!(target_endian = "big") {
-            return Err(again("was made for another byte order"));
-        }
-        let version = fields.u32()?;
-        if version != VERSION {
-            return Err(again(&format!(
-                "has version {version} of the format, this program reads version {VERSION}"
-            )));
-        }
-        let (header_sum, body_sum) = (fields.u32()?, fields.u32()?);
-        let expected_length = fields.u64()?;
-        if expected_length != length {
-            return Err(again(&format!("has {length} bytes instead of {expected_length}")));
-        }
-        let parsed = Self::parse_fields(&mut fields, body_sum);
-        // A damaged number of sections is found as such, or by the checksum.
-        let table_end = start.len() - fields.0.len();
-        if crc32fast::hash(&start[CHECKED..table_end]) != header_sum {
-            return Err(again("is damaged: its header has another checksum"));
-        }
-        let preamble = parsed?;
-        check_places(&preamble.table, table_end as u64, length)?;
-        Ok(preamble)
     }
+}
 
-    fn parse_fields(fields: &mut Fields, body_sum: u32) -> Checked<Self> {
-        let map = (fields.u32()?, fields.u32()?);
-        let alpha = fields.f32()?;
-        let (distribution, normalization) = (fields.u32()?, fields.u32()?);
-        let (texels, side_bits, cell_bits) = (fields.u32()?, fields.u32()?, fields.u32()?);
-        let (grid, bins) = (fields.grid()?, fields.grid()?);
-        let (finest, sections) = (fields.u32()?, fields.u32()? as usize);
-        if sections > MAX_SECTIONS {
-            return Err(again(&format!("is inconsistent: {sections} sections")));
-        }
-        let table = (0..sections).map(|_| fields.entry()).collect::<Checked<_>>()?;
+impl Fields {
+    fn new(head: &Head) -> Checked<Self> {
+        let mut words = Words(&head.fields);
+        let [width, height] = words.take()?;
+        let map = (width, height);
+        let [alpha, distribution, normalization] = words.take()?;
+        let [layout, side_bits, cell_bits] = words.take()?;
+        let (grid, bins) = (words.grid()?, words.grid()?);
+        let [finest] = words.take()?;
+        let origin = words.origin(map)?;
+        demand(words.0.is_empty(), || "too many fields".into())?;
 
+        check::map_size(map)?;
         let distribution = match distribution {
             0 => Distribution::Beckmann,
             1 => Distribution::Ggx,
-            other => return Err(again(&format!("is inconsistent: distribution {other}"))),
+            other => return Err(format!("distribution {other}")),
         };
         let normalization = match normalization {
             0 => Normalization::Projected,
             1 => Normalization::Paper,
-            other => return Err(again(&format!("is inconsistent: normalization {other}"))),
+            other => return Err(format!("normalization {other}")),
         };
-        let flake = Flake::new(distribution, alpha).map_err(|e| again(&format!("is inconsistent: {e}")))?;
-        let layout = match texels {
-            0 => Layout::Tiles(grid),
-            1 => Layout::Blocks(Geometry {
-                map,
-                side_bits,
-                cell_bits,
-                grid,
-            }),
-            other => return Err(again(&format!("is inconsistent: layout {other}"))),
+        let flake = Flake::new(distribution, f32::from_bits(alpha)).map_err(|e| e.to_string())?;
+        let (layout, leaf_bits) = match layout {
+            0 => {
+                check::tile_grid(&grid)?;
+                (Layout::Tiles(grid), LEAF_BITS)
+            }
+            1 => {
+                let geometry = Geometry {
+                    map,
+                    side_bits,
+                    cell_bits,
+                    grid,
+                };
+                check::geometry(&geometry)?;
+                (Layout::Blocks(geometry), side_bits)
+            }
+            other => return Err(format!("layout {other}")),
         };
-        check::map_size(map).map_err(inconsistent)?;
-        match &layout {
-            Layout::Tiles(grid) => check::tile_grid(grid),
-            Layout::Blocks(geometry) => check::geometry(geometry),
-        }
-        .map_err(inconsistent)?;
-        check::bins(&bins, alpha).map_err(inconsistent)?;
-        Ok(Self {
+        check::bins(&bins, flake.alpha())?;
+        let tree = Tree::new(map, leaf_bits);
+        let finest = finest as usize;
+        demand(finest <= tree.levels(), || {
+            "counts of a level that does not exist".into()
+        })?;
+        let fields = Self {
             map,
             model: FlakeModel { flake, normalization },
             layout,
             bins,
-            finest: finest as usize,
-            body_sum,
-            table,
-        })
+            tree,
+            finest,
+            origin,
+        };
+        let expected = fields.count_sections().end;
+        demand(head.sections() == expected, || {
+            format!("{} sections instead of {expected}", head.sections())
+        })?;
+        Ok(fields)
     }
 
-    fn header(&self, length: u64) -> Header {
-        let bytes = |counts: bool| {
-            self.table
-                .iter()
-                .filter(|entry| (entry.kind >= COUNTS) == counts)
-                .map(|entry| entry.count * u64::from(entry.width))
-                .sum()
-        };
+    fn texel_sections(&self) -> Range<usize> {
+        0..self.layout.sections()
+    }
+
+    fn count_sections(&self) -> Range<usize> {
+        let first = self.texel_sections().end;
+        first..first + self.tree.levels() - self.finest
+    }
+
+    fn header(&self, head: &Head) -> Header {
         Header {
             version: VERSION,
             map: self.map,
             alpha: self.model.flake.alpha(),
             distribution: self.model.flake.kind(),
             normalization: self.model.normalization,
-            texel_bytes: bytes(false),
-            count_bytes: bytes(true),
-            file_bytes: length,
+            origin: self.origin,
+            texel_bytes: head.section_bytes(self.texel_sections()),
+            count_bytes: head.section_bytes(self.count_sections()),
+            file_bytes: head.length,
         }
     }
 
-    fn check_sum(&self, file: &[u8]) -> Checked<()> {
-        let table_end = TABLE + ENTRY * self.table.len();
-        if crc32fast::hash(&file[table_end..]) != self.body_sum {
-            return Err(again("is damaged: its content has another checksum"));
-        }
-        Ok(())
-    }
-
-    fn structure(&self, file: &Arc<Mmap>) -> Checked<CompactBinMap> {
-        let mut sections = Sections {
-            file,
-            left: &self.table,
+    fn structure(self, contents: &mut Contents) -> Checked<CompactBinMap> {
+        let texels = match &self.layout {
+            Layout::Tiles(grid) => Texels::Tiles(self.tiles(grid, contents)?),
+            Layout::Blocks(geometry) => Texels::Blocks(blocks(geometry, contents)?),
         };
-        let (texels, leaf_bits) = match &self.layout {
-            Layout::Tiles(grid) => (Texels::Tiles(self.tiles(grid, &mut sections)?), LEAF_BITS),
-            Layout::Blocks(geometry) => (
-                Texels::Blocks(blocks(geometry, &mut sections)?),
-                geometry.side_bits,
-            ),
-        };
-        let tree = Tree::new(self.map, leaf_bits);
-        let counts = self.counts(&tree, &mut sections)?;
-        if !sections.left.is_empty() {
-            return Err(again("is inconsistent: it has more sections than it needs"));
-        }
+        let counts = self.counts(contents)?;
         Ok(CompactBinMap::assemble(
-            self.map, self.model, tree, texels, counts,
+            self.map, self.model, self.tree, texels, counts,
         ))
     }
 
-    fn tiles(&self, grid: &Grid, sections: &mut Sections) -> Checked<Tiles> {
+    fn tiles(&self, grid: &Grid, contents: &mut Contents) -> Checked<Tiles> {
         let (_, units) = Tiles::layout(grid, self.map);
-        let units = sections.take(WORDS, units as u64)?;
+        let units = contents.take_exactly(units as u64)?;
         Ok(Tiles::from_units(self.map, *grid, units))
     }
 
-    fn counts(&self, tree: &Tree, sections: &mut Sections) -> Checked<Counts> {
-        if self.finest > tree.levels() {
-            return Err(again("is inconsistent: counts of a level that does not exist"));
-        }
+    fn counts(&self, contents: &mut Contents) -> Checked<Counts> {
         let stride = u64::from(self.bins.size[0]) * u64::from(self.bins.size[1]);
         let mut levels = Vec::new();
         levels.resize_with(self.finest, || None);
-        for index in self.finest..tree.levels() {
-            let kind = COUNTS + index as u32;
+        for index in self.finest..self.tree.levels() {
             // Below 2^32 nodes of less than 2^49 bins could be more than 2^64 counts.
-            let count = (tree.nodes(index) as u64)
+            let count = (self.tree.nodes(index) as u64)
                 .checked_mul(stride)
                 .and_then(|count| count.checked_add(counts::PADDING as u64))
-                .ok_or_else(|| again("is inconsistent: more counts than memory"))?;
-            levels.push(Some(match sections.width() {
-                1 => Level::U8(sections.take(kind, count)?),
-                2 => Level::U16(sections.take(kind, count)?),
-                _ => Level::U32(sections.take(kind, count)?),
+                .ok_or("more counts than memory")?;
+            levels.push(Some(match contents.next_width() {
+                Some(1) => Level::U8(contents.take_exactly(count)?),
+                Some(2) => Level::U16(contents.take_exactly(count)?),
+                _ => Level::U32(contents.take_exactly(count)?),
             }));
         }
         Ok(Counts::from_levels(self.bins, self.model.flake.alpha(), levels))
     }
 }
 
-fn blocks(geometry: &Geometry, sections: &mut Sections) -> Checked<Blocks> {
+fn blocks(geometry: &Geometry, contents: &mut Contents) -> Checked<Blocks> {
     let blocks = geometry.block_count() as u64;
-    let words = sections.take(WORDS, geometry.units() as u64)?;
-    let extents = sections.take(EXTENTS, geometry.cell_rows() as u64)?;
-    let cells = check::extents(geometry, &extents).map_err(inconsistent)? as u64;
-    let rows = sections.take(ROWS, blocks * (geometry.cell_rows() as u64 + 1))?;
-    let offsets = match sections.width() {
-        2 => Offsets::Narrow(sections.take(OFFSETS, blocks * cells)?),
-        _ => Offsets::Wide(sections.take(OFFSETS, blocks * cells)?),
+    let words = contents.take_exactly(geometry.units() as u64)?;
+    let extents = contents.take_exactly(geometry.cell_rows() as u64)?;
+    let cells = check::extents(geometry, &extents)? as u64;
+    let rows = contents.take_exactly(blocks * (geometry.cell_rows() as u64 + 1))?;
+    let offsets = match contents.next_width() {
+        Some(2) => Offsets::Narrow(contents.take_exactly(blocks * cells)?),
+        _ => Offsets::Wide(contents.take_exactly(blocks * cells)?),
     };
-    let pointers = sections.take(POINTERS, blocks * geometry.pointers() as u64)?;
+    let pointers = contents.take_exactly(blocks * geometry.pointers() as u64)?;
     let parts = Parts {
         words,
         starts: geometry.starts().into(),
@@ -538,119 +469,83 @@ fn blocks(geometry: &Geometry, sections: &mut Sections) -> Checked<Blocks> {
         pointers,
     };
     let blocks = Blocks::from_parts(*geometry, parts);
-    check::blocks(&blocks).map_err(inconsistent)?;
+    check::blocks(&blocks)?;
     Ok(blocks)
 }
 
-/// Sections of the table stand one after the other and end with the file.
-fn check_places(table: &[Entry], table_end: u64, length: u64) -> Checked<()> {
-    let mut end = table_end;
-    for entry in table {
-        let bytes = entry.count.checked_mul(entry.width.into());
-        let next = bytes.and_then(|bytes| entry.offset.checked_add(bytes));
-        match next {
-            Some(next) if entry.offset == end.next_multiple_of(ALIGNMENT) && next <= length => end = next,
-            _ => return Err(again("is inconsistent: a section is not where it should be")),
-        }
-    }
-    if end != length {
-        return Err(again("is inconsistent: it does not end with its last section"));
-    }
-    Ok(())
-}
+/// Fields that are still to be read.
+struct Words<'a>(&'a [u32]);
 
-/// The sections that have not been taken yet.
-struct Sections<'a> {
-    file: &'a Arc<Mmap>,
-    left: &'a [Entry],
-}
-
-impl Sections<'_> {
-    /// Bytes of an element of the next section.
-    fn width(&self) -> u32 {
-        self.left.first().map_or(0, |entry| entry.width)
-    }
-
-    /// The next section, which must have this kind and number of elements.
-    fn take<T: Pod>(&mut self, kind: u32, count: u64) -> Checked<Array<T>> {
-        let wrong = || again(&format!("is inconsistent: section {kind} has another size"));
-        let (entry, left) = self.left.split_first().ok_or_else(wrong)?;
-        if (entry.kind, entry.width as usize, entry.count) != (kind, size_of::<T>(), count) {
-            return Err(wrong());
-        }
-        self.left = left;
-        let start = entry.offset as usize;
-        let end = start + size_of::<T>() * count as usize;
-        Array::mapped(self.file, start..end).ok_or_else(wrong)
-    }
-}
-
-/// Bytes that are still to be read.
-struct Fields<'a>(&'a [u8]);
-
-impl Fields<'_> {
-    fn bytes<const N: usize>(&mut self) -> Checked<[u8; N]> {
-        let (bytes, rest) = self
-            .0
-            .split_first_chunk()
-            .ok_or_else(|| again("is cut off in its header"))?;
+impl Words<'_> {
+    fn take<const N: usize>(&mut self) -> Checked<[u32; N]> {
+        let (words, rest) = self.0.split_first_chunk().ok_or("too few fields")?;
         self.0 = rest;
-        Ok(*bytes)
+        Ok(*words)
     }
 
-    fn u32(&mut self) -> Checked<u32> {
-        self.bytes().map(u32::from_le_bytes)
-    }
-
-    fn u64(&mut self) -> Checked<u64> {
-        self.bytes().map(u64::from_le_bytes)
-    }
-
-    fn f32(&mut self) -> Checked<f32> {
-        self.bytes().map(f32::from_le_bytes)
+    fn f64(&mut self) -> Checked<f64> {
+        let [low, high] = self.take()?;
+        Ok(f64::from_bits(u64::from(high) << 32 | u64::from(low)))
     }
 
     fn grid(&mut self) -> Checked<Grid> {
+        let [x, y, pitch] = self.take()?.map(f32::from_bits);
         Ok(Grid {
-            low: Vec2::new(self.f32()?, self.f32()?),
-            pitch: self.f32()?,
-            size: [self.u32()?, self.u32()?],
+            low: Vec2::new(x, y),
+            pitch,
+            size: self.take()?,
         })
     }
 
-    fn entry(&mut self) -> Checked<Entry> {
-        Ok(Entry {
-            kind: self.u32()?,
-            width: self.u32()?,
-            offset: self.u64()?,
-            count: self.u64()?,
+    /// Of a structure with `texels` columns and rows.
+    fn origin(&mut self, texels: (u32, u32)) -> Checked<Origin> {
+        let [interpolation, refinement, step] = self.take()?;
+        let step = f32::from_bits(step);
+        let slopes = SlopeCovariance {
+            xx: self.f64()?,
+            xy: self.f64()?,
+            yy: self.f64()?,
+        };
+        let [checksum] = self.take()?;
+        demand(is_covariance(&slopes), || {
+            let SlopeCovariance { xx, xy, yy } = slopes;
+            format!("a slope covariance of {xx}, {xy}, {yy}")
+        })?;
+        let possible = (1..=MAX_REFINEMENT).contains(&refinement) && step.is_finite() && step >= 0.0;
+        let whole = possible && texels.0 % refinement == 0 && texels.1 % refinement == 0;
+        let refinement = match interpolation {
+            0 if whole && refinement == 1 && step == 0.0 => None,
+            1 if whole => Some(Refinement {
+                refinement,
+                step: step.into(),
+                capped: false,
+            }),
+            _ => {
+                return Err(format!(
+                    "interpolation {interpolation} to {refinement} texels for each, {step} apart"
+                ));
+            }
+        };
+        let side = |texels: u32| texels / refinement.map_or(1, |r| r.refinement);
+        Ok(Origin {
+            size: (side(texels.0), side(texels.1)),
+            refinement,
+            slopes,
+            checksum,
         })
     }
 }
 
-/// A regular file and its length; opening a pipe would wait for its other end.
-fn open(path: &Path) -> Checked<(File, u64)> {
-    if !std::fs::metadata(path).map_err(unreadable)?.is_file() {
-        return Err("is not a regular file; give a file that `glints precompute` made".into());
-    }
-    let file = File::open(path).map_err(unreadable)?;
-    let length = file.metadata().map_err(unreadable)?.len();
-    if length == 0 {
-        return Err(again("is empty"));
-    }
-    Ok((file, length))
+/// Whether slopes of a map, which are at most `1 / MIN_Z`, can have this covariance, up to rounding.
+fn is_covariance(slopes: &SlopeCovariance) -> bool {
+    let SlopeCovariance { xx, xy, yy } = *slopes;
+    let largest = 1.001 / f64::from(MIN_Z).powi(2);
+    let variances = [xx, yy].iter().all(|v| (0.0..=largest).contains(v));
+    variances && xy.is_finite() && xy * xy <= 1.000_001 * xx * yy
 }
 
-fn unreadable(error: io::Error) -> String {
-    format!("cannot be read ({error}); check its name and its permissions")
-}
-
-fn again(what: &str) -> String {
-    format!("{what}; make it again with `glints precompute`")
-}
-
-fn inconsistent(what: String) -> String {
-    again(&format!("is inconsistent: {what}"))
+fn demand(holds: bool, otherwise: impl FnOnce() -> String) -> Checked<()> {
+    if holds { Ok(()) } else { Err(otherwise()) }
 }
 
 fn refused(path: &Path, reason: String) -> Error {

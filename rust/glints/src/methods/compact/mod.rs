@@ -96,7 +96,7 @@ use lobes::{Lobe, Query, Sums};
 use packing::WIDTHS;
 use tiles::Tiles;
 
-pub use file::{Header, VERSION, is_saved, read_header};
+pub use file::{Header, Origin, VERSION, is_saved, read_header};
 
 /// Share of a map's texels within reach of a typical half vector from which they are kept in the map's order.
 pub const ROUGH: f64 = 0.02;

@@ -34,25 +34,42 @@ fn answers(structure: &CompactBinMap) -> Vec<u32> {
     answers
 }
 
+/// Some map that the structure could be made from.
+fn origin(structure: &CompactBinMap) -> Origin {
+    Origin {
+        size: structure.map_size(),
+        refinement: None,
+        slopes: SlopeCovariance {
+            xx: 0.1 / 3.0,
+            xy: -1e-9,
+            yy: 0.7,
+        },
+        checksum: 0xfedc_ba98,
+    }
+}
+
 /// A saved structure, and where.
 fn saved(structure: &CompactBinMap) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.glints");
-    structure.save(&path).unwrap();
+    structure.save(&origin(structure), &path).unwrap();
     (folder, path)
 }
 
 fn assert_comes_back(structure: &CompactBinMap) {
     let (folder, path) = saved(structure);
-    let loaded = CompactBinMap::load(&path).unwrap();
+    let (loaded, header) = CompactBinMap::load(&path).unwrap();
     assert_eq!(answers(structure), answers(&loaded));
     assert_eq!(structure.bytes(), loaded.bytes());
-    let header = read_header(&path).unwrap();
+    assert_eq!(header, read_header(&path).unwrap());
     assert_eq!(header.map, structure.map_size());
+    assert_eq!(header.origin, origin(structure));
     assert_eq!(header.file_bytes, std::fs::metadata(&path).unwrap().len());
+    let (texels, counts) = structure.bytes();
+    assert!(header.texel_bytes <= texels as u64 && header.count_bytes == counts as u64);
     // A loaded structure is saved as the same file, and no other file is left.
     let bytes = std::fs::read(&path).unwrap();
-    loaded.save(&path).unwrap();
+    loaded.save(&header.origin, &path).unwrap();
     assert!(bytes == std::fs::read(&path).unwrap());
     assert_eq!(answers(structure), answers(&loaded));
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
@@ -157,12 +174,26 @@ fn refusals_say_why() {
         std::fs::write(&path, content).unwrap();
         refusal(&path)
     };
-    let mut newer = bytes.clone();
-    newer[12] += 1;
+    let of_version = |version: u32| {
+        let mut other = bytes.clone();
+        other[12..16].copy_from_slice(&version.to_le_bytes());
+        other
+    };
+    // As version 3 begins, which had the map's size behind the length.
+    let mut old = of_version(3)[..24].to_vec();
+    old.extend([112_u64.to_le_bytes(), (30_u64 << 32 | 20).to_le_bytes()].concat());
+    old.resize(112, 0);
     let mut damaged = bytes.clone();
     *damaged.last_mut().unwrap() ^= 1;
     for (message, word) in [
-        (refusal_of(&newer), format!("version {VERSION}").as_str()),
+        (
+            refusal_of(&of_version(VERSION + 1)),
+            "version 5 of the format, this program reads version 4",
+        ),
+        (
+            refusal_of(&old),
+            "version 3 of the format, this program reads version 4",
+        ),
         (refusal_of(&damaged), "checksum"),
         (refusal_of(&bytes[..bytes.len() - 1]), "bytes instead of"),
         (refusal_of(&bytes[..60]), "bytes instead of"),
@@ -176,7 +207,161 @@ fn refusals_say_why() {
         assert!(message.contains(word), "{word:?} is not in {message}");
         assert!(message.contains("glints precompute"), "{message}");
     }
+    // A header is read without the rest.
+    assert!(refusal_of(&damaged).contains("checksum") && read_header(&path).is_ok());
     assert!(refusal(&folder.path().join("missing")).contains("cannot be read"));
-    assert!(structure.save(&folder.path().join("no/folder")).is_err());
+    let origin = origin(&structure);
+    assert!(structure.save(&origin, &folder.path().join("no/folder")).is_err());
+    let turned = Origin {
+        size: (30, 20),
+        ..origin
+    };
+    let refused = structure.save(&turned, &path).unwrap_err().to_string();
+    assert!(
+        refused.contains("30 x 20") && refused.contains("20 x 30"),
+        "{refused}"
+    );
     assert!(!is_saved(folder.path()) && !is_saved(&folder.path().join("missing")));
+}
+
+#[test]
+fn what_it_was_made_from_comes_back() {
+    let map = random_map(24, 17, 0.8, 5);
+    let model = model(0.05);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.glints");
+    for asked in [None, Some(1), Some(3), Some(8)] {
+        let refinement = asked.map(|r| Refinement::new(&map, Some(model.flake), r).unwrap());
+        let refined = map.refined(asked.unwrap_or(1)).unwrap();
+        let origin = Origin::new(&map, refinement);
+        CompactBinMap::new(&refined, model).save(&origin, &path).unwrap();
+        let found = read_header(&path).unwrap().origin;
+        assert_eq!((found.size, found.checksum), ((24, 17), map.checksum()));
+        assert_eq!(found.slopes, map.slope_covariance());
+        let words = |r: Refinement| (r.refinement, r.step as f32);
+        assert_eq!(found.refinement.map(words), refinement.map(words));
+        assert_eq!(found.refinement.map(|r| r.refinement), asked);
+        let text = read_header(&path).unwrap().to_string();
+        for word in [
+            "24 x 17 texels",
+            &format!("{:08x}", map.checksum()),
+            "slope covariance",
+        ] {
+            assert!(text.contains(word), "{word:?} is not in {text}");
+        }
+        assert_eq!(text.contains("interpolated"), asked.is_some());
+    }
+}
+
+/// The file of a structure with other fields; its checksums are right.
+fn with_fields(fields: &[u32], structure: &CompactBinMap, path: &Path) -> String {
+    KIND.write(path, fields, &structure.sections()).unwrap();
+    let message = refusal(path);
+    let header = read_header(path).unwrap_err().to_string();
+    assert_eq!(message, header);
+    message
+}
+
+#[test]
+fn hostile_fields_are_refused() {
+    let structure = CompactBinMap::new(&random_map(20, 30, 0.5, 1), model(0.1));
+    let (_folder, path) = saved(&structure);
+    let fields = structure.fields(&origin(&structure));
+    let high = |value: f64| (value.to_bits() >> 32) as u32;
+    let nan = f32::NAN.to_bits();
+    let all_of = |field: usize, word: &'static str, values: &[u32]| {
+        for &value in values {
+            let mut fields = fields.clone();
+            fields[field] = value;
+            let message = with_fields(&fields, &structure, &path);
+            assert!(
+                message.contains("is inconsistent") && message.contains(word),
+                "{field}: {message}"
+            );
+            assert!(message.contains("glints precompute ibm"), "{message}");
+        }
+    };
+    all_of(19, "interpolation", &[2, u32::MAX, nan]);
+    // Without interpolation there is one texel for each, and no step.
+    all_of(20, "interpolation", &[0, 2, 9, u32::MAX]);
+    all_of(
+        21,
+        "interpolation",
+        &[nan, 1.5_f32.to_bits(), f32::INFINITY.to_bits()],
+    );
+    let variances = [-1.0, f64::NAN, f64::INFINITY, 2e6].map(high);
+    all_of(23, "slope covariance", &variances);
+    all_of(27, "slope covariance", &variances);
+    // More than the variances allow.
+    all_of(
+        25,
+        "slope covariance",
+        &[0.2, -0.2, f64::NAN, f64::INFINITY].map(high),
+    );
+    all_of(18, "level", &[1000]);
+
+    let mut interpolated = fields.clone();
+    interpolated[19] = 1;
+    interpolated[21] = 1.5_f32.to_bits();
+    for (refinement, step) in [
+        (0, 1.5_f32),
+        // Not a divisor of 20 and of 30 texels.
+        (3, 1.5),
+        (4, 1.5),
+        (10, 1.5),
+        (2, f32::NAN),
+        (2, f32::INFINITY),
+        (2, -1e-6),
+    ] {
+        (interpolated[20], interpolated[21]) = (refinement, step.to_bits());
+        let message = with_fields(&interpolated, &structure, &path);
+        assert!(
+            message.contains("interpolation"),
+            "{refinement} {step}: {message}"
+        );
+    }
+    // The twin: of these nothing is hostile.
+    for refinement in [1, 2, 5] {
+        (interpolated[20], interpolated[21]) = (refinement, 1.5_f32.to_bits());
+        KIND.write(&path, &interpolated, &structure.sections()).unwrap();
+        let (_, header) = CompactBinMap::load(&path).unwrap();
+        assert_eq!(header.origin.size, (20 / refinement, 30 / refinement));
+    }
+
+    for fields in [&fields[..fields.len() - 1], &[&fields[..], &[0]].concat(), &[]] {
+        let message = with_fields(fields, &structure, &path);
+        assert!(message.contains("fields"), "{message}");
+    }
+}
+
+#[test]
+fn sections_are_those_that_fields_ask_for() {
+    let structure = CompactBinMap::new(&random_map(150, 70, 0.5, 1), model(0.004));
+    let (_folder, path) = saved(&structure);
+    let fields = structure.fields(&origin(&structure));
+    let without = |index: usize| {
+        let mut sections = structure.sections();
+        sections.remove(index);
+        sections
+    };
+    let mut more = structure.sections();
+    more.push(Section::new(&[0_u8; 3]));
+    let mut other = structure.sections();
+    other[1] = Section::new(&[0_u64; 3]);
+    let mut longer = structure.sections();
+    longer[4] = Section::new(&[0_u16; 3]);
+    for (sections, word) in [
+        (without(0), "sections instead of"),
+        (without(3), "sections instead of"),
+        (more, "sections instead of"),
+        (other, "section 1"),
+        (longer, "section 4 has 3 elements"),
+    ] {
+        KIND.write(&path, &fields, &sections).unwrap();
+        let message = refusal(&path);
+        assert!(
+            message.contains("is inconsistent") && message.contains(word),
+            "{message}"
+        );
+    }
 }
