@@ -79,12 +79,11 @@ Parameters of this plugin
 Guidance
 --------
 
-- `structure_file` stands for the map, its interpolation and the flakes. If `filename` is given, too, its normals are
-  compared with those in the file, at the cost of reading the map, and so are `interpolation` and `refinement`. The map's
-  `beckmann` masking is then made of its own slopes, and images are bit for bit those of a structure that is built;
-  without `filename`, of the slopes in the file: those of its quantised normals, which makes a relative difference of
-  less than 3e-4, or of an interpolated map those of the refined one. The file may be replaced while it is in use
-  (`precompute --force` does), but must not be written to. Several BSDFs and processes share one copy of it in memory.
+- `structure_file` stands for the map, its interpolation and the flakes; images are bit for bit those of a structure that
+  is built from the map. If `filename` is given, too, it must be that map, which is told by a checksum of its normals, at
+  the cost of reading it. `interpolation` and `refinement`, if given, must be those of the file. The file may be replaced
+  while it is in use (`precompute --force` does), but must not be written to. Several BSDFs and processes share one copy
+  of it in memory.
 - `alpha` is the roughness of a single flake, not of the surface: that comes from the map. 0.0025 gives hard, sparse
   glints, 0.16 a smooth look with hardly any. Half of it asks for four times the bins.
 - `distribution` = `ggx`: a lobe is cut off at seven times its roughness, 2 % of it lie outside and are moved inside. In the
@@ -173,28 +172,22 @@ static glints::Brdf load_brdf(const mitsuba::Properties &props, const glints::No
     if (props.has_property("structure") && glints_mitsuba::choice_parameter(props, "structure", {"compact", "paper"}))
         glints_mitsuba::refuse_together(props, name, {"structure"},
                                         "the file holds the compact structure; leave one of them out");
-    if (!map) {
+    if (!map)
         glints_mitsuba::refuse_together(
             props, name, {"encoding", "flip_y"},
             "nothing is read but the file; leave one of them out, or give \"filename\", too");
-        glints_mitsuba::refuse_together(props, name, {"interpolation", "refinement"},
-                                        "the file stands for the surface, interpolated or not, as `glints precompute` "
-                                        "was told; leave one of them out, or give \"filename\", too, to compare");
-    }
 
     glints::SurfaceOptions surface = common; // what a scene leaves open is as the file was made for
     std::string file = glints_mitsuba::file_parameter(props, name);
     glints::SavedStructure saved = glints::SavedStructure::read(file);
+    check_interpolation(props, file, saved.refinement);
     if (!props.has_property("alpha"))
         surface.alpha = saved.alpha;
     if (!props.has_property("distribution"))
         surface.distribution = saved.distribution;
     if (!props.has_property("normalization"))
         surface.normalization = saved.normalization;
-    glints::Brdf brdf =
-        glints::Brdf::load_inverse_bin_map(file, surface, map, glints_mitsuba::filter_parameters(props));
-    check_interpolation(props, file, brdf.statistics().refinement);
-    return brdf;
+    return glints::Brdf::load_inverse_bin_map(file, surface, map, glints_mitsuba::filter_parameters(props));
 }
 
 extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn fn) {
