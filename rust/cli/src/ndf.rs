@@ -40,8 +40,8 @@ use crate::structures;
 /// right has a notch at each); EXR pictures have the values. What is printed tells peak, mean and integral.
 ///
 /// In the place of the map, a structure that `precompute` saved can be given: its own distribution is shown, for its
-/// flakes, and the footprint is in its texels (of an interpolated map, the refined ones). There is no other method to
-/// compare it with: those need the map.
+/// flakes and its interpolation, and the footprint is in texels of its map. There is no other method to compare it
+/// with: those need the map.
 ///
 /// Example: glints ndf flakes.exr --at 0.3,0.6 --footprint 32 --method ibm --compare direct -o ndf.png
 #[derive(Args)]
@@ -380,8 +380,8 @@ fn saved(arguments: &Arguments, header: &Header) -> Result<Shown> {
     Ok(Shown {
         methods: vec![(MethodName::Ibm, Box::new(structure))],
         model,
-        size: header.map,
-        refinement: None,
+        size: header.origin.size,
+        refinement: header.origin.refinement,
     })
 }
 

@@ -455,6 +455,30 @@ fn interpolated_maps_are_the_surface_of_curved_elements() {
     ] {
         assert!(text.contains(word), "{word:?} is not in {text}");
     }
+    // It is shown as what is built, over a footprint in texels of the map.
+    let show = |input: &str, output: &str, more: &[&str]| {
+        let options = [
+            "ndf",
+            input,
+            "-o",
+            output,
+            "--footprint",
+            "3",
+            "--size",
+            "32",
+            "--json",
+        ];
+        let report = json(folder.path(), &[&options[..], more].concat());
+        (report, std::fs::read(folder.path().join(output)).unwrap())
+    };
+    let refined = [&bilinear[..], &["--refinement", "4", "--method", "ibm"]].concat();
+    let (built, expected) = show("flakes.exr", "built.exr", &refined);
+    let (loaded, found) = show("flakes.glints", "loaded.exr", &[]);
+    assert!(found == expected);
+    assert_eq!(loaded["pictures"], built["pictures"]);
+    let step = |report: &Value| number(&report["refinement"]["step"]);
+    assert!((step(&loaded) / step(&built) - 1.0).abs() < 1e-6);
+    assert!(show("flakes.exr", "flat.exr", &["--method", "ibm"]).1 != expected);
     // A step that no refinement resolves is told, once, and the result is there.
     let output = glints(
         folder.path(),
