@@ -125,6 +125,6 @@ fn permutation(blocks: &Blocks, block: &Block) -> Checked<()> {
     )
 }
 
-fn demand(holds: bool, otherwise: impl FnOnce() -> String) -> Checked<()> {
+pub fn demand(holds: bool, otherwise: impl FnOnce() -> String) -> Checked<()> {
     if holds { Ok(()) } else { Err(otherwise()) }
 }

@@ -49,7 +49,7 @@ use std::path::Path;
 use glam::Vec2;
 
 use super::blocks::{Blocks, Geometry, Offsets, Parts};
-use super::check;
+use super::check::{self, demand};
 use super::counts::{self, Counts, Level};
 use super::cover::Tree;
 use super::grid::Grid;
@@ -542,10 +542,6 @@ fn is_covariance(slopes: &SlopeCovariance) -> bool {
     let largest = 1.001 / f64::from(MIN_Z).powi(2);
     let variances = [xx, yy].iter().all(|v| (0.0..=largest).contains(v));
     variances && xy.is_finite() && xy * xy <= 1.000_001 * xx * yy
-}
-
-fn demand(holds: bool, otherwise: impl FnOnce() -> String) -> Checked<()> {
-    if holds { Ok(()) } else { Err(otherwise()) }
 }
 
 fn refused(path: &Path, reason: String) -> Error {
