@@ -17,9 +17,10 @@
 //! ([`Parallelogram::overlap`]).
 //!
 //! **Under a Gaussian** ([`crate::footprint_filter`]) the border is that at which it is cut, and no texel inside weighs
-//! the same as its neighbour: all wait. Texels that are small against the deviation have the weight of the Taylor series
-//! of `footprint_filter`, for eight at once. Where the border cuts those that are at most [`FINE`] deviations wide, it is
-//! times the area inside, which moves less than 1e-5 of the footprint's weight. All others are integrated one by one
+//! the same as its neighbour: all wait. Texels are taken in equal parts ([`Parts`]), eight texels at once, of which each has the
+//! weight of the Taylor series of `footprint_filter`: as many parts as make them small against the deviation. Where the border
+//! cuts a texel, parts are at most [`FINE`] deviations wide, and count by their areas inside, which moves less than 1e-5 of the
+//! footprint's weight. Where that would take more than [`MOST_PARTS`] a side, texels are integrated one by one
 //! ([`Window::texel_weight`]).
 //!
 //! **Bounds** Positions count from the footprint's middle, in single precision: weights are within 1e-4 of the exact area,
@@ -36,8 +37,11 @@ use crate::footprint_filter::{KEPT, LONGEST_SMALL, Window};
 /// Thickness in texels below which single precision does not tell the two sides of a footprint apart.
 const THIN: f64 = 0.05;
 
-/// Deviations of a Gaussian up to whose width texels at its border weigh as in their middle.
+/// Deviations of a Gaussian up to whose width parts of texels at its border weigh as in their middle.
 const FINE: f64 = 0.1;
+
+/// Most parts along a side of a texel: more take longer than exact integration.
+const MOST_PARTS: f64 = 8.0;
 
 /// The border of a footprint in one period of the map.
 pub struct Border<'a> {
@@ -54,12 +58,19 @@ pub struct Border<'a> {
 /// The weights of texels under a Gaussian.
 struct Gaussian<'a> {
     window: &'a Window,
-    /// For small texels.
-    series: Option<Series>,
-    is_fine: bool,
+    /// Of texels inside the border, and of those that it cuts; `None`: exact integration.
+    inside: Option<Parts>,
+    cut: Option<Parts>,
 }
 
-/// The Taylor series of `footprint_filter`, of eight texels at once.
+/// Texels in equal squares, whose sides are the unit of length here.
+struct Parts {
+    side: u32,
+    series: Series,
+    slabs: [Slab; 2],
+}
+
+/// The Taylor series of `footprint_filter`, of eight squares at once.
 struct Series {
     /// By how much z changes over a texel's width and over its height.
     u: [f32; 2],
@@ -245,22 +256,81 @@ impl Slab {
 }
 
 impl<'a> Gaussian<'a> {
-    fn new(window: &'a Window, [u, v]: [DVec2; 2]) -> Self {
-        let longest = u.length().max(v.length());
-        let series = || Series {
-            u: u.as_vec2().to_array(),
-            v: v.as_vec2().to_array(),
-            uu: u.length_squared() as f32,
-            vv: v.length_squared() as f32,
-            uv: u.dot(v) as f32,
-            peak: (u.perp_dot(v).abs() / (std::f64::consts::TAU * KEPT)) as f32,
+    /// `gradients`: of s and t, per texel; `edges`: of a texel in deviations.
+    fn new(window: &'a Window, gradients: [DVec2; 2], edges: [DVec2; 2]) -> Self {
+        let longest = edges[0].length().max(edges[1].length());
+        let parts = |width: f64| {
+            let side = (longest / width).ceil();
+            (side <= MOST_PARTS).then(|| Parts::new(side, gradients, edges))
         };
         Self {
             window,
-            series: (longest <= LONGEST_SMALL).then(series),
-            is_fine: longest <= FINE,
+            inside: parts(LONGEST_SMALL),
+            cut: parts(FINE),
         }
     }
+}
+
+impl Parts {
+    fn new(side: f64, gradients: [DVec2; 2], edges: [DVec2; 2]) -> Self {
+        let [u, v] = edges.map(|edge| edge / side);
+        Self {
+            side: side as u32,
+            series: Series {
+                u: u.as_vec2().to_array(),
+                v: v.as_vec2().to_array(),
+                uu: u.length_squared() as f32,
+                vv: v.length_squared() as f32,
+                uv: u.dot(v) as f32,
+                peak: (u.perp_dot(v).abs() / (std::f64::consts::TAU * KEPT)) as f32,
+            },
+            slabs: gradients.map(|gradient| Slab::new(gradient / side)),
+        }
+    }
+
+    /// Sums over the parts of texels whose middles are at `(x, y)` from the Gaussian's, in texels.
+    #[inline]
+    fn sum(&self, x: f32x8, y: f32x8, weight: impl Fn(f32x8, f32x8) -> f32x8) -> f32x8 {
+        let first = |middle: f32x8| middle * self.side as f32 - 0.5 * (self.side as f32 - 1.0);
+        let (x, y) = (first(x), first(y));
+        let mut sum = f32x8::ZERO;
+        for row in 0..self.side {
+            for column in 0..self.side {
+                sum += weight(x + column as f32, y + row as f32);
+            }
+        }
+        sum
+    }
+
+    /// Weights of whole texels.
+    #[inline]
+    fn whole(&self, x: f32x8, y: f32x8) -> f32x8 {
+        self.sum(x, y, |x, y| self.series.at(x, y))
+    }
+
+    /// Weights of what lies inside the border.
+    #[inline]
+    fn inside(&self, x: f32x8, y: f32x8) -> f32x8 {
+        self.sum(x, y, |x, y| self.series.at(x, y) * shares(&self.slabs, x, y).0)
+    }
+}
+
+/// Shares of squares that lie inside both slabs, and which of them are cut by both. Those shares are products, which is right
+/// where a parallelogram's corners are right angles.
+#[inline(always)]
+fn shares(slabs: &[Slab; 2], x: f32x8, y: f32x8) -> (f32x8, u32) {
+    let [s, t] = slabs.each_ref().map(|slab| {
+        let distance = slab.distance(x, y);
+        let is_cut = distance.cmp_gt(f32x8::splat(0.5 - slab.variation()));
+        let touches = distance.cmp_lt(f32x8::splat(0.5 + slab.variation()));
+        (is_cut.blend(slab.share(distance), f32x8::ONE), is_cut, touches)
+    });
+    let touched = s.2 & t.2;
+    let both = touched & s.1 & t.1;
+    (
+        (s.0 * t.0).fast_max(f32x8::ZERO) & touched,
+        both.move_mask() as u32,
+    )
 }
 
 impl Series {
@@ -289,17 +359,17 @@ impl<'a> Border<'a> {
         let region = window.region();
         let center = region.center();
         let origin = center.floor();
-        let slabs = region.slabs_at(DVec2::ZERO).map(|(gradient, _)| gradient);
-        let thickness = slabs.map(|gradient| 1.0 / gradient.length());
+        let gradients = region.slabs_at(DVec2::ZERO).map(|(gradient, _)| gradient);
+        let thickness = gradients.map(|gradient| 1.0 / gradient.length());
         Self {
             region,
             origin: origin.as_vec2().to_array(),
             offset: (origin + 0.5 - center).as_vec2().to_array(),
-            slabs: slabs.map(Slab::new),
+            slabs: gradients.map(Slab::new),
             is_thin: thickness[0].min(thickness[1]) < THIN,
             gaussian: window
                 .texel_in_deviations()
-                .map(|edges| Gaussian::new(window, edges)),
+                .map(|edges| Gaussian::new(window, gradients, edges)),
         }
     }
 
@@ -320,23 +390,20 @@ impl<'a> Border<'a> {
 
     #[inline(never)]
     fn gaussian_weights(&self, gaussian: &Gaussian, lanes: u32, columns: f32x8, rows: f32x8) -> f32x8 {
+        let (x, y) = self.relative(columns, rows);
         let (touched, inside) = self.sides(columns, rows);
-        let touched = touched & lanes;
-        let (mut weights, exact) = match &gaussian.series {
-            None => (f32x8::ZERO, touched),
-            Some(series) => {
-                let (x, y) = self.relative(columns, rows);
-                let weights = series.at(x, y);
-                match touched & !inside {
-                    0 => (weights & mask(touched), 0),
-                    _ if gaussian.is_fine => {
-                        let areas = self.areas(touched, columns, rows);
-                        ((weights * areas) & mask(touched), 0)
-                    }
-                    cut => (weights & mask(touched), cut),
-                }
-            }
+        let (inside, cut) = (touched & lanes & inside, touched & lanes & !inside);
+        let (mut weights, mut exact) = (f32x8::ZERO, 0);
+        let mut add = |lanes: u32, found: Option<f32x8>| match found {
+            Some(found) => weights |= found & mask(lanes),
+            None => exact |= lanes,
         };
+        if inside != 0 {
+            add(inside, gaussian.inside.as_ref().map(|parts| parts.whole(x, y)));
+        }
+        if cut != 0 {
+            add(cut, gaussian.cut.as_ref().map(|parts| parts.inside(x, y)));
+        }
         for k in bits(exact) {
             let (column, row) = (columns.as_array_ref()[k] as u32, rows.as_array_ref()[k] as u32);
             weights.as_array_mut()[k] = gaussian.window.texel_weight(column, row) as f32;
@@ -371,27 +438,20 @@ impl<'a> Border<'a> {
     #[inline]
     fn areas(&self, lanes: u32, columns: f32x8, rows: f32x8) -> f32x8 {
         let (x, y) = self.relative(columns, rows);
-        let [s, t] = self.slabs.each_ref().map(|slab| {
-            let distance = slab.distance(x, y);
-            let is_cut = distance.cmp_gt(f32x8::splat(0.5 - slab.variation()));
-            let touches = distance.cmp_lt(f32x8::splat(0.5 + slab.variation()));
-            (slab.share(distance), is_cut, touches)
-        });
-        let mut areas = s.1.blend(s.0, f32x8::ONE) * t.1.blend(t.0, f32x8::ONE);
-        let touched = s.2 & t.2;
+        let (mut areas, both) = shares(&self.slabs, x, y);
         let exact = if self.is_thin {
-            touched
+            self.sides(columns, rows).0
         } else {
-            touched & s.1 & t.1
+            both
         };
-        for k in bits(lanes & exact.move_mask() as u32) {
+        for k in bits(lanes & exact) {
             let corner = DVec2::new(
                 f64::from(columns.as_array_ref()[k]),
                 f64::from(rows.as_array_ref()[k]),
             );
             areas.as_array_mut()[k] = self.region.overlap(corner, corner + 1.0) as f32;
         }
-        areas.fast_max(f32x8::ZERO) & touched
+        areas
     }
 
     /// Bit `8 y + x`: the footprint may touch this one of the 8 x 8 texels from `(column, row)` on. It touches no other.
