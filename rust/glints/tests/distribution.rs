@@ -367,6 +367,38 @@ fn samples_of_the_compact_structure_have_their_density() {
     }
 }
 
+#[test]
+fn samples_have_their_density_where_the_normals_have_long_tails() {
+    // The core of the directions is counted in bins, the tails are not.
+    let mut random = Random(3);
+    let normals: Vec<Vec3> = (0..100 * 100)
+        .map(|_| {
+            let (sin, cos) = (std::f32::consts::TAU * random.uniform()).sin_cos();
+            let slope = 0.01 * (1.0 - random.uniform()).powf(-0.4);
+            Vec3::new(slope * cos, slope * sin, 1.0)
+        })
+        .collect();
+    let map = NormalMap::from_normals("tailed", 100, 100, &normals).unwrap();
+    let wider = Direct::new(map.clone(), model(0.03, Normalization::Projected));
+    let method = CompactBinMap::new(&map, model(0.02, Normalization::Projected));
+    let direct = Direct::new(map, model(0.02, Normalization::Projected));
+    for (kind, footprint) in footprints_of_all_kinds(100).iter().enumerate().skip(2) {
+        let test = |density: &dyn Fn(Vec3) -> f32| {
+            let window = [0..48, 0..48];
+            chi_square(&method, density, footprint, (48, window), 16)
+        };
+        let exact = test(&|h| method.density(footprint, h));
+        assert!(is_plausible(exact), "footprint {kind}: {exact:?}");
+        let error = difference(&method, &direct, footprint);
+        assert!(error < 0.04, "footprint {kind}: {error}");
+        if kind == 2 {
+            // The broken twin: wider lobes.
+            let twin = test(&|h| wider.density(footprint, h));
+            assert!(!is_plausible(twin), "{twin:?}");
+        }
+    }
+}
+
 /// Pearson's statistic and its degrees of freedom for half vectors of `method` on the cells of a grid of
 /// `cells^2` over the projected hemisphere that lie in `window` (columns and rows), all other outcomes in one
 /// more cell. `density`, per solid angle, is integrated with `oversampling^2` points a cell.

@@ -127,8 +127,10 @@ fn attempt(path: &Path, random: &mut Random) -> Attempt {
 }
 
 /// Saved structures of several shapes: both ways of storing texels, with and without counts, with incomplete blocks, of
-/// interpolated maps.
+/// interpolated maps, with texels that are in no bin.
 fn valid_files(folder: &Path) -> Vec<Vec<u8>> {
+    /// Most slopes are small, and a few are large.
+    const LONG_TAILS: f32 = 0.0;
     // Columns and rows, roughness, slopes, and texels for each if the map is interpolated.
     let shapes = [
         (1, 1, 0.02, 0.3, None),
@@ -139,6 +141,7 @@ fn valid_files(folder: &Path) -> Vec<Vec<u8>> {
         (300, 40, 0.01, 1.0, Some(1)),
         (200, 300, 0.02, 0.8, None),
         (90, 260, 0.0003, 0.7, None),
+        (256, 256, 0.02, LONG_TAILS, None),
     ];
     let path = folder.join("valid.glints");
     shapes
@@ -146,7 +149,10 @@ fn valid_files(folder: &Path) -> Vec<Vec<u8>> {
         .enumerate()
         .map(|(index, (width, height, alpha, slope, refinement))| {
             let mut random = Random(index as u64);
-            let mut component = || slope * (2.0 * random.real() - 1.0);
+            let mut component = || match (slope, 2.0 * random.real() - 1.0) {
+                (LONG_TAILS, real) => 0.01 * real.abs().max(1e-4).powf(-0.4) * real.signum(),
+                (slope, real) => slope * real,
+            };
             let normals: Vec<Vec3> = (0..width * height)
                 .map(|_| Vec3::new(component(), component(), 1.0))
                 .collect();

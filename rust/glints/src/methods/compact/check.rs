@@ -9,6 +9,7 @@ use super::blocks::{Block, Blocks, Geometry, SIDE_BITS};
 use super::counts;
 use super::grid::Grid;
 use super::packing::WIDTHS;
+use super::strays::Strays;
 use super::tiles;
 use crate::normal_map::MAX_SIDE;
 
@@ -49,7 +50,7 @@ pub fn tile_grid(cells: &Grid) -> Checked<()> {
 /// The bins of counts for flakes of roughness `alpha`.
 pub fn bins(bins: &Grid, alpha: f32) -> Checked<()> {
     grid(bins)?;
-    demand(bins.pitch == counts::bin_width(alpha) as f32, || {
+    demand(counts::is_width(bins.pitch, alpha), || {
         format!("bins of width {}", bins.pitch)
     })
 }
@@ -77,6 +78,22 @@ pub fn extents(geometry: &Geometry, extents: &[[u32; 3]]) -> Checked<usize> {
         sum = sum.checked_add(cells).ok_or("more cells than fit 32 bits")?;
     }
     Ok(sum as usize)
+}
+
+/// Squares of strays follow each other, and strays are texels of the map.
+pub fn strays(strays: &Strays, (width, height): (u32, u32)) -> Checked<()> {
+    let [side, columns, rows] = strays.squares;
+    let squares = u64::from(columns) * u64::from(rows);
+    let offsets = &strays.offsets;
+    let sizes = side > 0 && squares > 0 && offsets.len() as u64 == squares + 1;
+    demand(sizes, || format!("{columns} x {rows} squares of strays"))?;
+    let ends = offsets[0] == 0 && offsets[offsets.len() - 1] as usize == strays.strays.len();
+    demand(ends && offsets.is_sorted(), || {
+        "squares of strays do not follow each other".into()
+    })?;
+    let texels = u64::from(width) * u64::from(height);
+    let inside = strays.strays.iter().all(|stray| u64::from(stray[2]) < texels);
+    demand(inside, || "a stray outside the map".into())
 }
 
 /// Runs of cells, places and pointers stay inside their blocks.

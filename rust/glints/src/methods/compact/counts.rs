@@ -36,8 +36,17 @@ const BIN_WIDTH: f64 = 0.7;
 const NARROW_BIN_WIDTH: f64 = 0.5;
 const CURVED: f32 = 0.1;
 
+/// The same where more than a share [`CONCENTRATED`] of a map's texels is within reach of each other: no other lobes hide by how
+/// much a lobe's shape differs from that of its bins' lobes.
+const CONCENTRATED_BIN_WIDTH: f64 = 0.6;
+pub const CONCENTRATED: f64 = 0.2;
+
 /// Least share of the squared roughness that a bin's lobe keeps.
 const LEAST_SHARE: f32 = 0.2;
+
+/// Width in bins of the margin around what is counted: one for the noise, and a little because bounds are those of normals
+/// before they are quantised.
+const MARGIN: f64 = 1.25;
 
 /// Numbers after the end of a level that a query may read and ignore.
 pub const PADDING: usize = 32;
@@ -98,31 +107,40 @@ pub fn project(normal: Vec3) -> Vec2 {
     normal.truncate() / (1.0 + normal.z).sqrt()
 }
 
-/// Width of the bins over the projection.
-pub fn bin_width(alpha: f32) -> f64 {
+/// Width of the bins over the projection for a map of whose texels `share` are within reach of each other.
+pub fn bin_width(alpha: f32, share: f64) -> f64 {
     let width = if alpha > CURVED {
         NARROW_BIN_WIDTH
+    } else if share > CONCENTRATED {
+        CONCENTRATED_BIN_WIDTH
     } else {
         BIN_WIDTH
     };
     width * f64::from(alpha) / std::f64::consts::SQRT_2
 }
 
-/// The bins of normals whose projections lie between two bounds: as wide as [`bin_width`], and one more on each side, for
-/// the noise.
-pub fn bins(alpha: f32, bounds: (Vec2, Vec2)) -> Grid {
-    let width = bin_width(alpha);
-    Grid::covering((bounds.0 - width as f32, bounds.1 + width as f32), width)
+/// Whether bins have a width that flakes of roughness `alpha` may have.
+pub fn is_width(width: f32, alpha: f32) -> bool {
+    [0.0, 1.0]
+        .iter()
+        .any(|&share| width == bin_width(alpha, share) as f32)
+}
+
+/// The bins of normals whose projections lie between two bounds: of this width, with a margin on each side.
+pub fn bins(width: f64, bounds: (Vec2, Vec2)) -> Grid {
+    let margin = (MARGIN * width) as f32;
+    Grid::covering((bounds.0 - margin, bounds.1 + margin), width)
 }
 
 impl Counts {
-    /// Counts the texels of all nodes of the levels from `finest` up; `normal` is that of a texel, as it is queried later.
+    /// Counts the texels of all nodes of the levels from `finest` up; `normal` is that of a texel, as it is queried later, or
+    /// `None` if it is not counted.
     pub fn new(
         tree: &Tree,
         bins: Grid,
         alpha: f32,
         finest: usize,
-        normal: impl Fn(u32, u32) -> Vec3 + Sync,
+        normal: impl Fn(u32, u32) -> Option<Vec3> + Sync,
     ) -> Self {
         let mut counts = Self::from_levels(bins, alpha, Vec::new());
         counts.levels.resize_with(finest.min(tree.levels()), || None);
@@ -134,7 +152,9 @@ impl Counts {
             let rect = tree.rect(node);
             for row in rect.low.1..rect.high.1 {
                 for column in rect.low.0..rect.high.0 {
-                    histogram[counts.bin(normal(column, row), (column, row))] += 1;
+                    if let Some(normal) = normal(column, row) {
+                        histogram[counts.bin(normal, (column, row))] += 1;
+                    }
                 }
             }
         });
@@ -250,6 +270,14 @@ impl Counts {
 
     fn stride(&self) -> usize {
         self.bins.size[0] as usize * self.bins.size[1] as usize
+    }
+
+    /// Whether noise leaves a normal inside the bins.
+    #[inline]
+    pub fn holds(bins: &Grid, normal: Vec3) -> bool {
+        let position = (project(normal) - bins.low) / bins.pitch;
+        let size = Vec2::new(bins.size[0] as f32, bins.size[1] as f32);
+        position.cmpge(Vec2::ONE).all() && position.cmple(size - 1.0).all()
     }
 
     /// The bin of a texel.
@@ -556,8 +584,8 @@ mod tests {
                 };
                 let lobe = Lobe::new(kind, f64::from(alpha).powi(2));
                 let tree = Tree::new((64, 64), 6);
-                let bins = bins(alpha, grid::bounds(&map, project));
-                let counts = Counts::new(&tree, bins, alpha, 0, |column, row| map.normal(column, row));
+                let bins = bins(bin_width(alpha, 0.0), grid::bounds(&map, project));
+                let counts = Counts::new(&tree, bins, alpha, 0, |column, row| Some(map.normal(column, row)));
                 let mut twin = 0.0_f32;
                 for k in 0..200 {
                     let half = half_vector((k as f32 + 0.5) / 200.0, 2.4 * k as f32);
@@ -590,8 +618,8 @@ mod tests {
                     normalization: Normalization::Projected,
                 };
                 let lobe = Lobe::new(kind, f64::from(alpha).powi(2));
-                let bins = bins(alpha, grid::bounds(&map, project));
-                let counts = Counts::new(&tree, bins, alpha, 0, |column, row| map.normal(column, row));
+                let bins = bins(bin_width(alpha, 0.0), grid::bounds(&map, project));
+                let counts = Counts::new(&tree, bins, alpha, 0, |column, row| Some(map.normal(column, row)));
                 // Midpoints of squares of equal solid angle.
                 const SIDE: usize = 400;
                 let whole = {

@@ -19,6 +19,7 @@
 //! | 21 | f32 | step between their normals, see [`Refinement::step`]; without interpolation 0 |
 //! | 22 | 3 f64 | covariance of that map's slopes: uu, uv, vv |
 //! | 28 | u32 | [`NormalMap::checksum`] of that map |
+//! | 29 | 3 u32 | of [`super::strays`]: width of a square, columns and rows of squares |
 //!
 //! and sections, in this order:
 //!
@@ -30,17 +31,19 @@
 //! | u16 or u32 | blocks: where the cells begin |
 //! | u16 | blocks: pointers of the permutations, each the number of another |
 //! | u8, u16 or u32 | for each level that has them, from the finest on: counts, with their padding |
+//! | u32 | strays: where the squares begin |
+//! | 3 u32 | strays |
 //!
 //! Whatever changes these arrays, or a constant that queries of them rely on, takes another version. Versions up to 3 had
 //! a head of their own, with the number of the version at the same place, so that they are told apart and refused.
 //!
-//! **The map** Fields from 19 on are what a renderer needs of the map when it has only the file: the slopes for shadowing, the map's
+//! **The map** Fields 19 to 28 are what a renderer needs of the map when it has only the file: the slopes for shadowing, the map's
 //! own, not those of quantised or refined normals; and by what the map is known again.
 //!
 //! **Loading** maps the file into memory, and reads all of it once, at about 8 GB/s once it is in the page cache (65 MB of a
 //! 4096 x 4096 map in 8 ms, where building takes 1.8 s): for the checksum, which finds damage, and for [`super::check`],
 //! which makes sure that no query can leave an array, whoever wrote the file. Every size is derived from the fields and
-//! compared with the table.
+//! compared with the table, that of the strays with where their squares begin.
 
 use std::fmt;
 use std::ops::Range;
@@ -53,6 +56,7 @@ use super::check::{self, demand};
 use super::counts::{self, Counts, Level};
 use super::cover::Tree;
 use super::grid::Grid;
+use super::strays::Strays;
 use super::tiles::Tiles;
 use super::{CompactBinMap, LEAF_BITS, Texels};
 use crate::container::{Checked, Contents, Head, Kind, Section};
@@ -120,7 +124,7 @@ pub struct Header {
     pub origin: Origin,
     /// Bytes of the quantised normals with what finds them.
     pub texel_bytes: u64,
-    /// Bytes of the counts.
+    /// Bytes of the counts, and of the texels that are in no bin.
     pub count_bytes: u64,
     /// Bytes of the file.
     pub file_bytes: u64,
@@ -256,6 +260,8 @@ impl CompactBinMap {
             Level::U16(counts) => Section::new(counts),
             Level::U32(counts) => Section::new(counts),
         }));
+        let Strays { offsets, strays, .. } = &self.strays;
+        sections.extend([Section::new(offsets), Section::new(strays)]);
         sections
     }
 
@@ -295,6 +301,7 @@ impl CompactBinMap {
         fields.extend([finest as u32, interpolation, refinement, step.to_bits()]);
         fields.extend([xx, xy, yy].into_iter().flat_map(halves));
         fields.push(origin.checksum);
+        fields.extend(self.strays.squares);
         fields
     }
 }
@@ -308,6 +315,8 @@ struct Fields {
     tree: Tree,
     finest: usize,
     origin: Origin,
+    /// Of the strays.
+    squares: [u32; 3],
 }
 
 /// How texels are stored.
@@ -336,6 +345,7 @@ impl Fields {
         let (grid, bins) = (words.grid()?, words.grid()?);
         let [finest] = words.take()?;
         let origin = words.origin(map)?;
+        let squares = words.take()?;
         demand(words.0.is_empty(), || "too many fields".into())?;
 
         check::map_size(map)?;
@@ -381,8 +391,9 @@ impl Fields {
             tree,
             finest,
             origin,
+            squares,
         };
-        let expected = fields.count_sections().end;
+        let expected = fields.stray_sections().end;
         demand(head.sections() == expected, || {
             format!("{} sections instead of {expected}", head.sections())
         })?;
@@ -398,6 +409,11 @@ impl Fields {
         first..first + self.tree.levels() - self.finest
     }
 
+    fn stray_sections(&self) -> Range<usize> {
+        let first = self.count_sections().end;
+        first..first + 2
+    }
+
     fn header(&self, head: &Head) -> Header {
         Header {
             version: VERSION,
@@ -407,7 +423,7 @@ impl Fields {
             normalization: self.model.normalization,
             origin: self.origin,
             texel_bytes: head.section_bytes(self.texel_sections()),
-            count_bytes: head.section_bytes(self.count_sections()),
+            count_bytes: head.section_bytes(self.count_sections().start..self.stray_sections().end),
             file_bytes: head.length,
         }
     }
@@ -418,8 +434,14 @@ impl Fields {
             Layout::Blocks(geometry) => Texels::Blocks(blocks(geometry, contents)?),
         };
         let counts = self.counts(contents)?;
+        let strays = Strays {
+            squares: self.squares,
+            offsets: contents.take()?,
+            strays: contents.take()?,
+        };
+        check::strays(&strays, self.map)?;
         Ok(CompactBinMap::assemble(
-            self.map, self.model, self.tree, texels, counts,
+            self.map, self.model, self.tree, texels, counts, strays,
         ))
     }
 

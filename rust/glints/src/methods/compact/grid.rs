@@ -76,4 +76,15 @@ pub fn bounds(map: &NormalMap, project: impl Fn(Vec3) -> Vec2 + Sync) -> (Vec2, 
         .reduce(|| EMPTY, |a, b| (a.0.min(b.0), a.1.max(b.1)))
 }
 
+/// About 65536 of a map's normals, which tell how they are distributed; a prime number of texels apart, so that no pattern of
+/// the map is met.
+pub fn sparse(map: &NormalMap) -> impl Iterator<Item = Vec3> + '_ {
+    let normals = map.normals();
+    let step = [1, 3, 7, 17, 61, 251, 1021, 4093]
+        .into_iter()
+        .rfind(|step| step << 16 <= normals.len())
+        .unwrap_or(1);
+    normals.iter().step_by(step).copied()
+}
+
 const EMPTY: (Vec2, Vec2) = (Vec2::INFINITY, Vec2::NEG_INFINITY);

@@ -31,7 +31,8 @@
 //!
 //! Footprints that hold many texels that matter are large against them, and their distribution is a mean over many: above
 //! a size, [`counts`] answer for whole squares of texels, and squares at the border that are small against the footprint
-//! are weighted by their area ([`cover`]). Texels that the border cuts get their exact area ([`border`]).
+//! are weighted by their area ([`cover`]). Texels that the border cuts get their exact area ([`border`]). Counts are for the core
+//! of a map's directions; the few texels in long tails are listed and added one by one ([`strays`]).
 //!
 //! **Memory** 2.5 to 4 bytes a texel for the normals, a byte and a half at most for the rest: counts are kept of as many
 //! levels, from the whole map down, as fit into [`BYTES_PER_TEXEL`].
@@ -75,6 +76,7 @@ mod grid;
 mod lanes;
 mod lobes;
 mod packing;
+mod strays;
 mod tiles;
 
 use glam::{Vec2, Vec3};
@@ -94,6 +96,7 @@ use cover::{Node, Rect, Scale, Treatment, Tree};
 use grid::Grid;
 use lobes::{Lobe, Query, Sums};
 use packing::WIDTHS;
+use strays::Strays;
 use tiles::Tiles;
 
 pub use file::{Header, Origin, VERSION, is_saved, read_header};
@@ -129,6 +132,8 @@ pub struct CompactBinMap {
     tree: Tree,
     texels: Texels,
     counts: Counts,
+    /// Texels that are in no bin.
+    strays: Strays,
     /// Finest level of the tree with counts, or its root.
     finest: usize,
     /// Relative deviation of the parts of each level's nodes.
@@ -174,11 +179,8 @@ impl CompactBinMap {
         let size = (map.width(), map.height());
         let alpha = model.flake.alpha();
         let bounds = grid::bounds(map, Vec3::truncate);
-        let share = share_in_reach(
-            map,
-            bounds,
-            &Lobe::new(model.flake.kind(), f64::from(alpha).powi(2)),
-        );
+        let lobe = Lobe::new(model.flake.kind(), f64::from(alpha).powi(2));
+        let share = share_in_reach(map, bounds, &lobe);
         let (texels, leaf_bits) = if share >= ROUGH {
             let grid = tiles::grid(bounds, QUANTUM * deviation(alpha));
             (Texels::Tiles(Tiles::new(map, grid)), LEAF_BITS)
@@ -187,19 +189,36 @@ impl CompactBinMap {
             (Texels::Blocks(Blocks::new(map, geometry)), geometry.side_bits)
         };
         let tree = Tree::new(size, leaf_bits);
-        let bins = counts::bins(alpha, grid::bounds(map, counts::project));
+        let core = strays::core(map, lobe.reach());
+        let bins = counts::bins(counts::bin_width(alpha, share), core.bounds);
         let least_level = match texels {
             Texels::Tiles(_) => 0,
             Texels::Blocks(_) => 1,
         };
-        let finest = finest_counted_level(&tree, &bins, least_level, texels.bytes(), share);
+        let taken = texels.bytes() as f64 + core.strays * Strays::BYTES * map.normals().len() as f64;
+        let finest = finest_counted_level(&tree, &bins, least_level, taken, share);
         let grid = texels.grid();
         let quantised = |column, row| grid.normal(grid.cell(map.normal(column, row)));
-        let counts = Counts::new(&tree, bins, alpha, finest, quantised);
-        Self::assemble(size, model, tree, texels, counts)
+        let is_counted = |normal: &Vec3| core.strays == 0.0 || Counts::holds(&bins, *normal);
+        let counts = Counts::new(&tree, bins, alpha, finest, |column, row| {
+            Some(quantised(column, row)).filter(is_counted)
+        });
+        let strays = if core.strays == 0.0 || finest >= tree.levels() {
+            Strays::none()
+        } else {
+            Strays::of(map, grid, lobe.reach(), |normal| !is_counted(normal))
+        };
+        Self::assemble(size, model, tree, texels, counts, strays)
     }
 
-    fn assemble(map: (u32, u32), model: FlakeModel, tree: Tree, texels: Texels, counts: Counts) -> Self {
+    fn assemble(
+        map: (u32, u32),
+        model: FlakeModel,
+        tree: Tree,
+        texels: Texels,
+        counts: Counts,
+        strays: Strays,
+    ) -> Self {
         let alpha2 = f64::from(model.flake.alpha()).powi(2);
         // What quantisation adds to the normals' variance, a twelfth of the pitch squared along each axis, the lobe
         // gives up.
@@ -216,6 +235,7 @@ impl CompactBinMap {
             tree,
             texels,
             counts,
+            strays,
         }
     }
 
@@ -226,7 +246,7 @@ impl CompactBinMap {
 
     /// Bytes of the quantised normals with what finds them, and of the counts.
     pub fn bytes(&self) -> (usize, usize) {
-        (self.texels.bytes(), self.counts.bytes())
+        (self.texels.bytes(), self.counts.bytes() + self.strays.bytes())
     }
 
     /// The normal of a texel, quantised.
@@ -293,6 +313,20 @@ impl CompactBinMap {
         }
     }
 
+    /// The weight of a texel in `part` where its node is taken by its counts; where it is not, nothing.
+    fn counted(&self, part: &cover::Part, texel: u32) -> f64 {
+        let texel = (texel % self.map.0, texel / self.map.0);
+        match self.tree.covering(part, texel, &self.is_unit()) {
+            (node, Treatment::Whole(weight)) if self.counts.has(node.level) => weight,
+            _ => 0.0,
+        }
+    }
+
+    /// Whether a texel is in no bin.
+    fn is_stray(&self, normal: Vec3) -> bool {
+        !self.strays.is_empty() && !Counts::holds(self.counts.bins(), normal)
+    }
+
     /// Value and density over a footprint.
     fn query(&self, footprint: &Footprint, query: Query) -> (f32, f32) {
         let mut sums = Sums::new(query, self.lobe, *self.texels.grid());
@@ -344,14 +378,14 @@ impl CompactBinMap {
             self.cover(None, scale, |node, treatment| {
                 covered.add(node, treatment.scaled(even), &[]);
             });
-            covered.finish();
+            covered.finish(&[(cover::Part::new(None, scale), even)]);
         } else if let Some(window) = filtered.single_window() {
             let border = Border::new(&window);
             let mut covered = Covered::new(self, std::slice::from_ref(&border), sums);
             self.cover(Some(&window), scale, |node, treatment| {
                 covered.add(node, treatment, &[0])
             });
-            covered.finish();
+            covered.finish(&[(cover::Part::new(Some(&window), scale), 1.0)]);
         } else {
             self.add_parts(footprint, filtered, scale, sums);
         }
@@ -400,7 +434,12 @@ impl CompactBinMap {
             (cuts, rest) = rest.split_at(same.iter().filter_map(cut).count());
             covered.add_node(&same[0].1, weight, cuts);
         }
-        covered.finish();
+        let part = |window| cover::Part::new(window, scale);
+        let mut parts: Vec<_> = windows.iter().map(|window| (part(Some(window)), 1.0)).collect();
+        if whole > 0.0 {
+            parts.push((part(None), whole));
+        }
+        covered.finish(&parts);
     }
 }
 
@@ -471,12 +510,17 @@ impl<'a> Covered<'a> {
         }
     }
 
-    fn finish(self) {
+    /// `parts`: that were covered, and how often each.
+    fn finish(self, parts: &[(cover::Part, f64)]) {
         if let Some(mut blocks) = self.blocks {
             blocks.flush(self.sums);
         }
         if let Some(mut counts) = self.counts {
             counts.finish(&self.map.lobe, self.sums);
+            let (map, sums) = (self.map, self.sums);
+            let in_part = |texel, (part, times): &(cover::Part, f64)| times * map.counted(part, texel);
+            let weight = |texel| parts.iter().map(|part| in_part(texel, part)).sum::<f64>() as f32;
+            map.strays.add(weight, sums);
         }
     }
 }
@@ -515,9 +559,10 @@ impl Method for CompactBinMap {
             Treatment::Nothing => return None,
             _ => texel,
         };
-        if matches!(treatment, Treatment::Whole(_)) && self.counts.has(node.level) {
-            self.counts
-                .sample(&self.lobe, self.texels.normal(texel), texel, lobe)
+        let normal = self.texels.normal(texel);
+        let is_whole = matches!(treatment, Treatment::Whole(_));
+        if is_whole && self.counts.has(node.level) && !self.is_stray(normal) {
+            self.counts.sample(&self.lobe, normal, texel, lobe)
         } else {
             exact(texel)
         }
@@ -528,11 +573,11 @@ impl Method for CompactBinMap {
     }
 
     fn structure_bytes(&self) -> usize {
-        self.texels.bytes() + self.counts.bytes()
+        self.texels.bytes() + self.counts.bytes() + self.strays.bytes()
     }
 
     fn bins(&self) -> Option<u32> {
-        Some((2.0 / counts::bin_width(self.model.flake.alpha())) as u32)
+        Some((2.0 / self.counts.bins().pitch) as u32)
     }
 
     fn name(&self) -> &'static str {
@@ -555,17 +600,11 @@ fn texel_of(rect: &Rect, u: [f32; 4]) -> (u32, u32) {
 /// times the lobe's area, from a histogram over `SIDE^2` cells.
 fn share_in_reach(map: &NormalMap, bounds: (Vec2, Vec2), lobe: &Lobe) -> f64 {
     const SIDE: u32 = 64;
-    /// About so many texels are looked at, a prime number of texels apart, so that no pattern of the map is met.
-    const SAMPLES: usize = 1 << 16;
-    let step = [1, 3, 7, 17, 61, 251, 1021, 4093]
-        .into_iter()
-        .rfind(|step| step * SAMPLES <= map.normals().len())
-        .unwrap_or(1);
     let extent = (bounds.1 - bounds.0).max_element().max(1e-6);
     let grid = Grid::covering(bounds, f64::from(extent) / f64::from(SIDE));
     let mut histogram = vec![0.0_f64; (SIDE as usize + 2).pow(2)];
     let mut count = 0.0;
-    for &normal in map.normals().iter().step_by(step) {
+    for normal in grid::sparse(map) {
         let [x, y] = grid.cell(normal);
         histogram[(y * (SIDE + 2) + x) as usize] += 1.0;
         count += 1.0;
@@ -621,15 +660,21 @@ fn block_geometry(map: (u32, u32), alpha: f32, share: f64, bounds: (Vec2, Vec2))
 }
 
 /// The finest level whose counts fit into what the texels leave, none finer than useful.
-fn finest_counted_level(tree: &Tree, bins: &Grid, least: usize, texel_bytes: usize, share: f64) -> usize {
+fn finest_counted_level(tree: &Tree, bins: &Grid, least: usize, taken: f64, share: f64) -> usize {
     let stride = f64::from(bins.size[0]) * f64::from(bins.size[1]);
     let root = tree.rect(&tree.root());
-    let mut left = BYTES_PER_TEXEL * root.area() - texel_bytes as f64;
+    let mut left = BYTES_PER_TEXEL * root.area() - taken;
     let mut finest = tree.levels();
     for level in (least..tree.levels()).rev() {
         let texels = f64::from(tree.side(level)).powi(2);
-        // About forty bins are within reach of a normal; the fullest may hold several times their mean.
-        let bytes_per_count = match 6.0 * texels * share / 40.0 {
+        // About forty bins are within reach of a normal; the fullest may hold several times their mean, and more than half
+        // of a direction that most texels share.
+        let fullest = if share > counts::CONCENTRATED {
+            0.6
+        } else {
+            6.0 / 40.0
+        };
+        let bytes_per_count = match fullest * texels * share {
             fullest if fullest < 256.0 => 1.0,
             fullest if fullest < 65_536.0 => 2.0,
             _ => 4.0,

@@ -1,5 +1,6 @@
 use super::*;
 use crate::flakes::Normalization;
+use crate::methods::direct::Direct;
 use crate::microfacet::{Distribution, Flake};
 use proptest::prelude::*;
 
@@ -119,4 +120,59 @@ fn the_number_of_threads_does_not_matter() {
             .collect::<Vec<_>>()
     };
     assert_eq!(query(1), query(3));
+}
+
+/// A map of flakes of which most lie almost flat, and a few on edge.
+pub fn tailed_map(side: u32) -> NormalMap {
+    let slopes = random_map(side, side, 1.0, 11);
+    let tilted: Vec<Vec3> = slopes
+        .normals()
+        .iter()
+        .map(|n| {
+            let [share, turn] = (n.truncate() / n.z).to_array();
+            let direction = Vec2::from_angle(std::f32::consts::PI * turn);
+            (direction * 0.01 * share.abs().max(1e-4).powf(-0.4)).extend(1.0)
+        })
+        .collect();
+    NormalMap::from_normals("tailed", side, side, &tilted).unwrap()
+}
+
+#[test]
+fn strays_are_added_where_nodes_are_counted() {
+    const SIDE: u32 = 256;
+    let map = tailed_map(SIDE);
+    let model = model(0.02);
+    let direct = Direct::new(map.clone(), model);
+    let mut compact = CompactBinMap::new(&map, model);
+    let strays: Vec<Vec3> = compact
+        .strays
+        .texels()
+        .map(|texel| map.normals()[texel as usize])
+        .collect();
+    assert!(
+        (100..SIDE.pow(2) as usize / 25).contains(&strays.len()),
+        "{}",
+        strays.len()
+    );
+    // All of the map, once and a few times: a smaller footprint's border is blurred, which single lobes show.
+    let error = |compact: &CompactBinMap| {
+        let (mut difference, mut sum) = (0.0, 0.0);
+        for width in [256.0, 1024.0] {
+            let edges = [glam::DVec2::new(width, 0.0), glam::DVec2::new(0.0, width)];
+            let footprint = Footprint::in_texels(SIDE, SIDE, glam::DVec2::splat(110.0), edges[0], edges[1]);
+            for &h in strays.iter().step_by(strays.len() / 50) {
+                let expected = direct.ndf(&footprint, h);
+                difference += (compact.ndf(&footprint, h) - expected).abs();
+                sum += expected;
+            }
+        }
+        difference / sum
+    };
+    let found = error(&compact);
+    // Next to the core few texels are counted, with the noise of counts.
+    assert!(found < 0.05, "{found}");
+    // The broken twin.
+    compact.strays = Strays::none();
+    let twin = error(&compact);
+    assert!(twin > 0.3, "{twin}");
 }

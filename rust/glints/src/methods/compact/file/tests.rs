@@ -1,4 +1,4 @@
-use super::super::tests::{model, random_map};
+use super::super::tests::{model, random_map, tailed_map};
 use super::super::{block_geometry, counts as bin_counts, grid};
 use super::*;
 use crate::footprint::Footprint;
@@ -90,9 +90,19 @@ fn in_blocks(map: &NormalMap, alpha: f32) -> CompactBinMap {
     let geometry = block_geometry(size, alpha, 1e-4, grid::bounds(map, Vec3::truncate));
     let blocks = Blocks::new(map, geometry);
     let tree = Tree::new(size, geometry.side_bits);
-    let bins = bin_counts::bins(alpha, grid::bounds(map, bin_counts::project));
-    let counts = Counts::new(&tree, bins, alpha, tree.levels(), |_, _| Vec3::Z);
-    CompactBinMap::assemble(size, model(alpha), tree, Texels::Blocks(blocks), counts)
+    let bins = bin_counts::bins(
+        bin_counts::bin_width(alpha, 0.0),
+        grid::bounds(map, bin_counts::project),
+    );
+    let counts = Counts::new(&tree, bins, alpha, tree.levels(), |_, _| Some(Vec3::Z));
+    CompactBinMap::assemble(
+        size,
+        model(alpha),
+        tree,
+        Texels::Blocks(blocks),
+        counts,
+        Strays::none(),
+    )
 }
 
 proptest! {
@@ -364,4 +374,43 @@ fn sections_are_those_that_fields_ask_for() {
             "{message}"
         );
     }
+}
+
+#[test]
+fn strays_come_back_and_hostile_ones_are_refused() {
+    let structure = CompactBinMap::new(&tailed_map(256), model(0.02));
+    assert!(!structure.strays.is_empty());
+    assert_comes_back(&structure);
+    let (_folder, path) = saved(&structure);
+    let fields = structure.fields(&origin(&structure));
+    let [side, columns, rows] = structure.strays.squares;
+    let refused = |fields: &[u32], offsets: &[u32], strays: &[[u32; 3]], word: &str| {
+        let mut sections = structure.sections();
+        let first = sections.len() - 2;
+        sections.truncate(first);
+        sections.extend([Section::new(offsets), Section::new(strays)]);
+        KIND.write(&path, fields, &sections).unwrap();
+        let message = refusal(&path);
+        assert!(
+            message.contains("is inconsistent") && message.contains(word),
+            "{message}"
+        );
+    };
+    let Strays { offsets, strays, .. } = &structure.strays;
+    for squares in [
+        [0, columns, rows],
+        [side, columns + 1, rows],
+        [side, 0, rows],
+        [side, 1 << 31, 1 << 31],
+    ] {
+        let changed = [&fields[..29], &squares].concat();
+        refused(&changed, offsets, strays, "squares of strays");
+    }
+    let mut unsorted = offsets.to_vec();
+    unsorted[1] = u32::MAX;
+    refused(&fields, &unsorted, strays, "follow each other");
+    refused(&fields, offsets, &strays[1..], "follow each other");
+    let mut outside = strays.to_vec();
+    outside[0][2] = 256 * 256;
+    refused(&fields, offsets, &outside, "outside the map");
 }
