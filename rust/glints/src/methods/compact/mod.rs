@@ -47,7 +47,9 @@
 //! counts. In between, evaluation grows with the number of texels within reach, by some nanoseconds each, until the border
 //! may be blurred: that bounds low roughness by the texels of a few blocks, and high roughness by those of the cut squares.
 //! Most expensive are footprints of hundreds of texels' width, or long and thin ones, at high roughness: thousands of lobes
-//! matter, of which any subset would be off by more than 2 %, and squares with counts are not small against the footprint.
+//! matter, of which any subset would be off by more than 2 %, and squares with counts are not small against the footprint. So it
+//! is where most of a map's normals are alike, but a few on edge, and roughness is low: normals take 32 bits over all directions, which
+//! leaves no memory for counts of squares of less than 512 texels a side.
 //!
 //! **Gaussian footprints** ([`CompactBinMap::with_filter`], [`crate::footprint_filter`]) go the same ways. No two texels weigh
 //! the same, so that single texels are weighted one by one where they are near the half vector, eight at a time ([`border`]),
