@@ -186,6 +186,32 @@ Environment Environment::fit(const std::vector<float> &directions, const std::ve
     });
 }
 
+Environment Environment::fit_map(uint32_t width, uint32_t height, const std::vector<float> &rgb, uint32_t lobes,
+                                 float epsilon, uint32_t candidates) {
+    return translated([&] {
+        return Environment(std::make_unique<Impl>(
+            Impl{bridge::environment_of_map(width, height, slice(rgb), lobes, epsilon, candidates)}));
+    });
+}
+
+Environment Environment::from_file(const std::string &filename, float epsilon, uint32_t candidates) {
+    return translated([&] {
+        return Environment(
+            std::make_unique<Impl>(Impl{bridge::environment_from_file(utf8(filename), epsilon, candidates)}));
+    });
+}
+
+Environment Environment::turned(const Vec3 &x, const Vec3 &y, const Vec3 &z) const {
+    return translated([&] {
+        return Environment(
+            std::make_unique<Impl>(Impl{m_impl->environment->turned({to_bridge(x), to_bridge(y), to_bridge(z)})}));
+    });
+}
+
+double Environment::saved_residual() const noexcept { return m_impl->environment->saved_residual(); }
+
+std::string Environment::map_name() const { return std::string(m_impl->environment->map_name()); }
+
 uint32_t Environment::lobe_count() const noexcept { return m_impl->environment->lobe_count(); }
 
 Lobe Environment::lobe(uint32_t index) const noexcept {

@@ -232,6 +232,19 @@ public:
     /// each. Deterministic.
     static Environment fit(const std::vector<float> &directions, const std::vector<float> &weights, uint32_t lobes,
                            float epsilon = 0.3f, uint32_t candidates = 8, uint64_t seed = 0);
+    /// Fits to a latitude-longitude picture, `width * height * 3` radiances row by row, what `glints environment` fits
+    /// to such a file. In its frame: +y in the first row, +z in the middle, +x a quarter of the width from the left.
+    static Environment fit_map(uint32_t width, uint32_t height, const std::vector<float> &rgb, uint32_t lobes,
+                               float epsilon = 0.3f, uint32_t candidates = 8);
+    /// A fit that `glints environment` saved, in the frame of its map.
+    static Environment from_file(const std::string &filename, float epsilon = 0.3f, uint32_t candidates = 8);
+
+    /// The same light in another frame, in which `x`, `y`, `z` are this one's axes: unit vectors at right angles.
+    Environment turned(const Vec3 &x, const Vec3 &y, const Vec3 &z) const;
+
+    /// Of a fit from a file: the residual that it had, and the name of its map. One and empty for others.
+    double saved_residual() const noexcept;
+    std::string map_name() const;
 
     uint32_t lobe_count() const noexcept;
     Lobe lobe(uint32_t index) const noexcept;

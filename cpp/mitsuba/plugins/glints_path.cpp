@@ -30,6 +30,8 @@ differentials. Otherwise it renders what `path` renders: on scenes without glint
 |                 |                 | being sampled. Far less noise, some bias. (Default: false)                        |
 | `environment_   | integer         | Number of those pieces, spherical Gaussians, at most 1024. More: less bias, more  |
 | lobes`          |                 | noise. (Default: 128)                                                             |
+| `environment_   | string          | Instead of `environment_lobes`: a fit that `glints environment` saved from the    |
+| file`           |                 | scene's environment map. Nothing is fitted then.                                  |
 | `environment_   | float           | A piece extends to where its Gaussian has so many times its peak, in (0, 1).      |
 | epsilon`        |                 | (Default: 0.3)                                                                    |
 | `environment_   | integer         | Pieces that a sample considers, 1 to 64, to keep one of them by its reflection.   |
@@ -55,12 +57,18 @@ Environment prefiltering
   sample of a scene is taken; the log says how long that took, and how much light the mixture has in other places than the
   map. Each direction's light is divided among the Gaussians, so energy is kept, in all colours. If the
   environment is changed afterwards, make a new integrator.
+- `environment_file` saves that time, and the fit can be looked at before: `glints environment studio.exr -o studio.json
+  --picture studio.png`. Its Gaussians lie in the frame of the map, and are turned by the emitter's `to_world`, which has to be a
+  rotation or a mirror image. Their light is always that of the scene's emitter, so that `scale` is right by itself. A file whose
+  Gaussians do not lie where the emitter's light comes from (3 % of the light more elsewhere than in the file's own map) is an
+  error. In `scalar_rgb` the image is that of a fit in place, to rounding; in spectral variants, where an `envmap` holds no
+  colours, a fit in place is made of directions that the emitter draws, and differs by its noise.
 - At a glint BSDF one Gaussian is drawn, by its energy times a cheap NDF and among candidates by its reflection, and a
   direction from it for shadows and Fresnel term. The NDF is averaged over the rectangle of half vectors that the Gaussian's extent covers. Directions that the BSDF
   draws count nothing when they meet the environment: there is no multiple importance sampling between the two ways.
   Other emitters, other materials and the visible background are as without prefiltering.
-- It needs range queries of the NDF: `glints_direct` and `glints_unfiltered` have them, alone or in `twosided`. Other glint
-  BSDFs are rendered unprefiltered, and a warning names them once.
+- It needs range queries of the NDF: `glints_tensor`, `glints_direct` and `glints_unfiltered` have them, alone or in `twosided`.
+  Other glint BSDFs are rendered unprefiltered, and a warning names them once.
 - Use it where glints reflect windows, softboxes and skies that are small against the whole of their lobe. It blurs the shapes of
   lights in nearly smooth metal: unsuitable where NDFs are narrower than the lights' pieces.
 
@@ -164,9 +172,11 @@ public:
     explicit GlintsPath(const Properties &props)
         : Base(props), m_footprint(props), m_indirect(props.get<float>("indirect_footprint", 1.f)),
           m_prefilter(props.get<bool>("environment_prefilter", false)),
-          m_lobes(unsigned_parameter(props, "environment_lobes", 128)),
-          m_epsilon(props.get<float>("environment_epsilon", .3f)),
-          m_candidates(unsigned_parameter(props, "environment_candidates", 8)) {
+          m_options{unsigned_parameter(props, "environment_lobes", 128),
+                    props.get<float>("environment_epsilon", .3f),
+                    unsigned_parameter(props, "environment_candidates", 8),
+                    {},
+                    {}} {
         auto check = [&](bool right, const char *name, const char *domain) {
             if (!right)
                 Throw("%s: parameter \"%s\" is %s; it must be %s.", props.plugin_name(), name, props.as_string(name),
@@ -174,9 +184,13 @@ public:
         };
         check(std::isfinite(m_indirect) && m_indirect >= 0.f, "indirect_footprint",
               "a factor that is finite and not negative, 0 to switch deeper footprints off");
-        check(m_lobes >= 1 && m_lobes <= 1024, "environment_lobes", "a number of spherical Gaussians in [1, 1024]");
-        check(m_candidates >= 1 && m_candidates <= 64, "environment_candidates", "a number of candidates in [1, 64]");
-        check(m_epsilon > 0.f && m_epsilon < 1.f, "environment_epsilon", "in (0, 1)");
+        check(m_options.lobes >= 1 && m_options.lobes <= 1024, "environment_lobes",
+              "a number of spherical Gaussians in [1, 1024]");
+        check(m_options.candidates >= 1 && m_options.candidates <= 64, "environment_candidates",
+              "a number of candidates in [1, 64]");
+        check(m_options.epsilon > 0.f && m_options.epsilon < 1.f, "environment_epsilon", "in (0, 1)");
+        if (props.has_property("environment_file"))
+            load_environment(props, "environment_file");
     }
 
     std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler, const RayDifferential3f &camera_ray,
@@ -193,9 +207,9 @@ public:
     std::string to_string() const override {
         return tfm::format("GlintsPath[\n  max_depth = %i,\n  rr_depth = %i,\n  footprint = %s,\n"
                            "  indirect_footprint = %s,\n  environment_prefilter = %s,\n  environment_lobes = %i,\n"
-                           "  environment_epsilon = %s\n]",
+                           "  environment_epsilon = %s,\n  environment_file = \"%s\"\n]",
                            (int) m_max_depth, (int) m_rr_depth, m_footprint.to_string(), m_indirect, m_prefilter,
-                           m_lobes, m_epsilon);
+                           m_options.lobes, m_options.epsilon, m_options.file);
     }
 
     MI_DECLARE_CLASS(GlintsPath)
@@ -360,6 +374,19 @@ private:
         bool previous_was_delta = true; ///< the camera: nothing else can find what its rays hit
     };
 
+    /// The lobes of a file, also where prefiltering is switched off: a wrong file is told when the scene is loaded.
+    void load_environment(const Properties &props, const char *name) {
+        refuse_together(props, name, {"environment_lobes"}, "the file has its lobes; leave one of them out");
+        m_options.file = file_parameter(props, name);
+        try {
+            m_options.saved.emplace(
+                glints::Environment::from_file(m_options.file, m_options.epsilon, m_options.candidates));
+        } catch (const glints::Error &e) {
+            Throw("%s: parameter \"%s\": %s", props.plugin_name(), name, e.what());
+        }
+        m_options.lobes = m_options.saved->lobe_count();
+    }
+
     static Float power_heuristic(Float pdf, Float other) {
         // As a ratio of densities, for squares may overflow.
         Float ratio = other / pdf;
@@ -383,8 +410,7 @@ private:
             auto fits = [&](const auto &e) { return e->emitter() == scene->environment(); };
             auto found = std::find_if(m_environments.begin(), m_environments.end(), fits);
             if (found == m_environments.end())
-                found = m_environments.insert(
-                    found, std::make_unique<Environment>("glints_path", scene, m_lobes, m_epsilon, m_candidates));
+                found = m_environments.insert(found, std::make_unique<Environment>("glints_path", scene, m_options));
             known = found->get();
             m_environment.store(known, std::memory_order_release);
         }
@@ -394,9 +420,7 @@ private:
     FootprintRule m_footprint;
     float m_indirect;
     bool m_prefilter;
-    uint32_t m_lobes;
-    float m_epsilon;
-    uint32_t m_candidates;
+    EnvironmentOptions m_options;
 
     mutable std::mutex m_mutex;
     mutable std::vector<std::unique_ptr<Environment>> m_environments; ///< of all scenes seen, kept for other threads

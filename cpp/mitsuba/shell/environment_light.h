@@ -4,6 +4,9 @@
 #include "prefiltered_bsdf.h"
 
 #include <algorithm>
+#include <array>
+#include <cmath>
+#include <drjit/tensor.h>
 #include <mitsuba/core/logger.h>
 #include <mitsuba/core/spectrum.h>
 #include <mitsuba/core/timer.h>
@@ -12,21 +15,41 @@
 #include <mitsuba/render/scene.h>
 #include <mitsuba/render/shape.h>
 #include <optional>
+#include <string>
+#include <typeinfo>
 #include <unordered_map>
 #include <vector>
 
 namespace glints_mitsuba {
 
-/// Fitted to directions that the emitter itself draws, on a regular grid of its random numbers: any environment, whatever
-/// its resolution, and bright spots get many. Light is kept in every colour: RGB, or the spectrum every 5 nm, as
-/// Mitsuba's own tables have it.
+/// How an environment is made into lobes.
+struct EnvironmentOptions {
+    uint32_t lobes = 128;
+    float epsilon = .3f;
+    uint32_t candidates = 8;
+    std::string file;                         ///< for messages
+    std::optional<glints::Environment> saved; ///< of the file, in the emitter's frame; empty: fit in place
+};
+
+/// A scene's environment as a mixture of spherical Gaussians.
+///
+/// How lobes share light: everything an environment may be, its `scale` and its `to_world`.
+///
+/// - The lobes come from a file, or are fitted to the picture of an `envmap` as `glints environment` does it, in the emitter's
+///   own frame, and then turned by `to_world`. Other environments, and pictures in spectral variants (which store no
+///   colours), are fitted to directions that the emitter draws.
+/// - The light of the lobes is always the emitter's own, of directions that it draws on a regular grid of its random numbers:
+///   any environment, whatever its resolution, and bright spots get many. In every colour: RGB, or the spectrum every
+///   5 nm, as Mitsuba's own tables have it. So `scale` needs nothing from the file.
+/// - Lobes from a file have to lie where the emitter's light does: no more light elsewhere than in the map that the file
+///   was made from, up to `Tolerance`.
 template <typename Float, typename Spectrum>
 class EnvironmentLight {
 public:
     MI_IMPORT_TYPES(Scene, Emitter, BSDF)
     using Sides = PrefilteredSides<Float, Spectrum>;
 
-    EnvironmentLight(const char *owner, const Scene *scene, uint32_t lobes, float epsilon, uint32_t candidates)
+    EnvironmentLight(const char *owner, const Scene *scene, const EnvironmentOptions &options)
         : m_emitter(const_cast<Emitter *>(scene->environment())) {
         find_bsdfs(owner, scene);
         mitsuba::Timer timer;
@@ -36,14 +59,16 @@ public:
             total += weight;
         if (!(total > 0.))
             return; // black: nothing to reflect, by either way
-        m_mixture.emplace(glints::Environment::fit(samples.directions, samples.weights, lobes, epsilon, candidates));
+        m_mixture.emplace(options.saved ? in_world(owner, *options.saved) : fitted(owner, samples, options));
         m_energies = m_mixture->energies(samples.directions, samples.values, Channels);
         double residual = m_mixture->residual(samples.directions, samples.weights, samples.radiances);
+        if (options.saved)
+            check_place(owner, options, residual);
         using mitsuba::ClassName, mitsuba::Info;
         Log(Info,
-            "%s: environment as %u spherical Gaussians, fitted in %s; %.1f %% of its light is not where the map has "
-            "it.",
-            owner, m_mixture->lobe_count(), mitsuba::util::time_string((float) timer.value(), true), 100. * residual);
+            "%s: environment as %u spherical Gaussians, %s in %s; %.1f %% of its light is not where the map has it.",
+            owner, m_mixture->lobe_count(), options.saved ? "loaded and checked" : "fitted",
+            mitsuba::util::time_string((float) timer.value(), true), 100. * residual);
     }
 
     const Emitter *emitter() const { return m_emitter.get(); }
@@ -75,11 +100,87 @@ public:
     }
 
 private:
+    /// Of all light, more than directions drawn instead of pixels make in the residual.
+    static constexpr double Tolerance = .03;
+
     static constexpr uint32_t Channels = mitsuba::is_spectral_v<UnpolarizedSpectrum> ? MI_CIE_SAMPLES : 3;
     static constexpr uint32_t GridSide = 128; ///< 16384 directions
 
     struct Samples {
         std::vector<float> directions, weights, radiances, values;
+    };
+
+    glints::Environment fitted(const char *owner, const Samples &samples, const EnvironmentOptions &options) const {
+        if constexpr (!mitsuba::is_spectral_v<UnpolarizedSpectrum>) {
+            Picture picture;
+            if (m_emitter->class_name() == "EnvironmentMapEmitter")
+                const_cast<Emitter *>(m_emitter.get())->traverse(&picture); // looks, only
+            if (picture.height > 0)
+                return in_world(owner,
+                                glints::Environment::fit_map(picture.width, picture.height, picture.rgb, options.lobes,
+                                                             options.epsilon, options.candidates));
+        }
+        return glints::Environment::fit(samples.directions, samples.weights, options.lobes, options.epsilon,
+                                        options.candidates);
+    }
+
+    /// Lobes in the emitter's frame as they are in the world.
+    glints::Environment in_world(const char *owner, const glints::Environment &local) const {
+        using mitsuba::ClassName, mitsuba::Error;
+        auto to_world = m_emitter->world_transform();
+        std::array<Vector3f, 3> axes;
+        for (int i = 0; i < 3; ++i) {
+            Vector3f axis(0.f);
+            axis[i] = 1.f;
+            axes[i] = to_world * axis;
+        }
+        for (int i = 0; i < 3; ++i)
+            if (std::abs(dr::norm(axes[i]) - 1.f) > 1e-3f || std::abs(dr::dot(axes[i], axes[(i + 1) % 3])) > 1e-3f)
+                Throw("%s: environment_prefilter: \"to_world\" of the scene's environment scales or shears; its light "
+                      "has no "
+                      "direction then. Give it rotations alone.",
+                      owner);
+        auto vec3 = [](const Vector3f &v) { return glints::Vec3{v.x(), v.y(), v.z()}; };
+        return local.turned(vec3(axes[0]), vec3(axes[1]), vec3(axes[2]));
+    }
+
+    void check_place(const char *owner, const EnvironmentOptions &options, double residual) const {
+        using mitsuba::ClassName, mitsuba::Error;
+        double expected = options.saved->saved_residual();
+        if (residual > expected + Tolerance)
+            Throw(
+                "%s: parameter \"environment_file\": \"%s\" was made from another environment than the scene has: "
+                "%.1f "
+                "%% of the scene's light is not where the file's lobes are, and %.1f %% of its map \"%s\". Make it "
+                "from the map of the scene's envmap, with `glints environment`; the emitter's to_world and scale are "
+                "taken into account.",
+                owner, options.file, 100. * residual, 100. * expected, options.saved->map_name());
+    }
+
+    /// The radiances of an `envmap`, without `scale`, and without the column that repeats the first one.
+    class Picture final : public mitsuba::TraversalCallback {
+    public:
+        uint32_t width = 0, height = 0;
+        std::vector<float> rgb;
+
+    protected:
+        using Tensor = dr::Tensor<mitsuba::DynamicBuffer<Float>>;
+
+        void put_value(std::string_view name, void *value, uint32_t, const std::type_info &type) override {
+            if (name != "data" || type != typeid(Tensor))
+                return;
+            auto &data = *static_cast<Tensor *>(value);
+            if (data.ndim() != 3 || data.shape(1) < 2 || data.shape(2) != 3)
+                return;
+            height = (uint32_t) data.shape(0);
+            width = (uint32_t) data.shape(1) - 1;
+            const Float *pixels = data.array().data();
+            for (uint32_t row = 0; row < height; ++row) {
+                const Float *begin = pixels + 3 * size_t(row) * (width + 1);
+                rgb.insert(rgb.end(), begin, begin + 3 * width);
+            }
+        }
+        void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
     };
 
     Samples draw() const {

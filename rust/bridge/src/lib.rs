@@ -15,6 +15,8 @@ use std::time::Instant;
 
 use glam::{Mat3, Vec2, Vec3};
 use glints::brdf::{Brdf as Core, Masking};
+use glints::environment_file;
+use glints::environment_map::EnvironmentMap;
 use glints::error::{Error, Result};
 use glints::flake_layer::{self, LayerMasking};
 use glints::flakes::{FlakeModel, Normalization};
@@ -300,6 +302,22 @@ mod ffi {
             candidates: u32,
             seed: u64,
         ) -> Result<Box<Environment>>;
+        /// Of a latitude-longitude picture of radiances, three numbers a pixel, in the picture's frame.
+        fn environment_of_map(
+            width: u32,
+            height: u32,
+            rgb: &[f32],
+            lobes: u32,
+            epsilon: f32,
+            candidates: u32,
+        ) -> Result<Box<Environment>>;
+        /// A fit of `glints environment`, in the frame of its picture.
+        fn environment_from_file(filename: &str, epsilon: f32, candidates: u32) -> Result<Box<Environment>>;
+        /// The same light in another frame, where the axes x, y, z are `axes`.
+        fn turned(self: &Environment, axes: [Vector; 3]) -> Result<Box<Environment>>;
+        /// The residual and the map's file name that the file tells; one and empty for a fit that comes from no file.
+        fn saved_residual(self: &Environment) -> f64;
+        fn map_name(self: &Environment) -> String;
         fn lobe_count(self: &Environment) -> u32;
         fn lobe(self: &Environment, index: u32) -> Lobe;
         fn density(self: &Environment, direction: Vector) -> f32;
@@ -854,7 +872,14 @@ impl Brdf {
         let to_local = Mat3::from_cols_array_2d(&axes.map(|axis| from_ffi(axis).to_array())).transpose();
         let footprint = self.footprint(footprint);
         let draw = |prefilter: &Prefilter| {
-            prefilter.sample(&self.core, &footprint, from_ffi(wi), &to_local, &environment.0, u)
+            prefilter.sample(
+                &self.core,
+                &footprint,
+                from_ffi(wi),
+                &to_local,
+                &environment.core,
+                u,
+            )
         };
         self.prefilter.as_ref().and_then(draw).map_or(
             ffi::LobeSample {
@@ -905,7 +930,11 @@ impl Brdf {
 // ---- environments ---------------------------------------------------------------------------------------------------------------
 
 /// A mixture of spherical Gaussians with the supports of its lobes.
-pub struct Environment(prefilter::Environment);
+pub struct Environment {
+    core: prefilter::Environment,
+    /// Residual and name of the map, for a fit from a file.
+    saved: Option<(f64, String)>,
+}
 
 fn environment(
     directions: &[f32],
@@ -922,19 +951,68 @@ fn environment(
             weights,
         };
         let mixture = SphericalGaussians::fit(light, lobes as usize, seed)?;
-        Ok(Box::new(Environment(prefilter::Environment::new(
-            mixture, epsilon, candidates,
-        )?)))
+        Environment::of(mixture, epsilon, candidates)
+    })
+}
+
+fn environment_of_map(
+    width: u32,
+    height: u32,
+    rgb: &[f32],
+    lobes: u32,
+    epsilon: f32,
+    candidates: u32,
+) -> Result<Box<Environment>> {
+    guarded("lobes", &lobes.to_string(), || {
+        let pixels = rgb.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect();
+        let fit = EnvironmentMap::new(width, height, pixels)?.fit(lobes as usize)?;
+        Environment::of(fit.mixture, epsilon, candidates)
+    })
+}
+
+fn environment_from_file(filename: &str, epsilon: f32, candidates: u32) -> Result<Box<Environment>> {
+    guarded("environment_file", filename, || {
+        let (fit, map) = environment_file::load(Path::new(filename))?;
+        let mut environment = Environment::of(fit.mixture, epsilon, candidates)?;
+        environment.saved = Some((fit.residual, map.name));
+        Ok(environment)
     })
 }
 
 impl Environment {
+    fn of(mixture: SphericalGaussians, epsilon: f32, candidates: u32) -> Result<Box<Self>> {
+        Ok(Box::new(Self {
+            core: prefilter::Environment::new(mixture, epsilon, candidates)?,
+            saved: None,
+        }))
+    }
+
+    fn turned(&self, axes: [ffi::Vector; 3]) -> Result<Box<Self>> {
+        guarded("to_world", "", || {
+            let axes = Mat3::from_cols_array_2d(&axes.map(|axis| from_ffi(axis).to_array()));
+            Ok(Box::new(Self {
+                core: self.core.turned(&axes),
+                saved: self.saved.clone(),
+            }))
+        })
+    }
+
+    fn saved_residual(&self) -> f64 {
+        self.saved.as_ref().map_or(1.0, |(residual, _)| *residual)
+    }
+
+    fn map_name(&self) -> String {
+        self.saved
+            .as_ref()
+            .map_or(String::new(), |(_, name)| name.clone())
+    }
+
     fn lobe_count(&self) -> u32 {
-        self.0.mixture().lobes().len() as u32
+        self.core.mixture().lobes().len() as u32
     }
 
     fn lobe(&self, index: u32) -> ffi::Lobe {
-        let (lobes, weights) = (self.0.mixture().lobes(), self.0.mixture().weights());
+        let (lobes, weights) = (self.core.mixture().lobes(), self.core.mixture().weights());
         let index = (index as usize).min(lobes.len() - 1);
         ffi::Lobe {
             axis: to_ffi(lobes[index].axis),
@@ -944,13 +1022,13 @@ impl Environment {
     }
 
     fn density(&self, direction: ffi::Vector) -> f32 {
-        self.0.mixture().density(from_ffi(direction))
+        self.core.mixture().density(from_ffi(direction))
     }
 
     fn energies(&self, directions: &[f32], values: &[f32], channels: u32) -> Result<Vec<f32>> {
         guarded("channels", &channels.to_string(), || {
             let energies = self
-                .0
+                .core
                 .mixture()
                 .energies(&vectors(directions), values, channels as usize);
             Ok(energies.into_iter().map(|energy| energy as f32).collect())
@@ -963,7 +1041,7 @@ impl Environment {
                 directions: &vectors(directions),
                 weights,
             };
-            Ok(self.0.mixture().residual(light, radiances))
+            Ok(self.core.mixture().residual(light, radiances))
         })
     }
 }

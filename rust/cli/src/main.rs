@@ -1,10 +1,12 @@
-//! The command-line tool `glints`: looks at normal maps and at their filtered distributions of normals, and
-//! writes the files that the methods read.
+//! The command-line tool `glints`: looks at normal maps, at their filtered distributions of normals and at
+//! environments, and writes the files that the methods read.
 //!
 //! Exit status: 0, 1 for a failure, 2 for wrong usage, 130 after an interruption. Messages are one line on
 //! standard error; results go to standard output.
 
 mod arguments;
+mod environment;
+mod environment_picture;
 mod failure;
 mod flakes;
 mod info;
@@ -23,8 +25,8 @@ use clap::{Parser, Subcommand};
 
 use failure::{Failure, Result};
 
-/// Looks at normal maps and at their filtered distributions of normals, and writes the files that the
-/// methods of mitsuba-glints read.
+/// Looks at normal maps, at their filtered distributions of normals and at environments, and writes the files
+/// that the methods of mitsuba-glints read.
 #[derive(Parser)]
 #[command(name = "glints", version, max_term_width = 110)]
 struct Arguments {
@@ -39,6 +41,7 @@ enum Command {
     #[command(subcommand)]
     Precompute(precompute::Command),
     Flakes(flakes::Arguments),
+    Environment(environment::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -71,5 +74,6 @@ fn run() -> Result<()> {
         Command::Ndf(arguments) => ndf::run(&arguments),
         Command::Precompute(command) => precompute::run(&command),
         Command::Flakes(arguments) => flakes::run(&arguments),
+        Command::Environment(arguments) => environment::run(&arguments),
     }
 }

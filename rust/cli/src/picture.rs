@@ -125,7 +125,7 @@ fn colour(t: f32) -> Rgb<u8> {
 }
 
 /// The transfer function of sRGB (IEC 61966-2-1), to 8 bits.
-fn srgb(linear: f32) -> u8 {
+pub fn srgb(linear: f32) -> u8 {
     let linear = linear.clamp(0.0, 1.0);
     let encoded = if linear <= 0.003_130_8 {
         12.92 * linear

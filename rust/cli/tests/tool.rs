@@ -87,10 +87,16 @@ fn number(value: &Value) -> f64 {
 fn help_teaches_every_command() {
     let folder = tempfile::tempdir().unwrap();
     let help = succeeds(folder.path(), &["--help"]);
-    for command in ["info", "ndf", "precompute", "flakes"] {
+    for command in ["info", "ndf", "precompute", "flakes", "environment"] {
         assert!(help.contains(command), "{help}");
     }
-    for command in [&["info"][..], &["ndf"], &["precompute", "ibm"], &["flakes"]] {
+    for command in [
+        &["info"][..],
+        &["ndf"],
+        &["precompute", "ibm"],
+        &["flakes"],
+        &["environment"],
+    ] {
         let help = succeeds(folder.path(), &[command, &["--help"]].concat());
         assert!(help.contains("Example: glints "), "{help}");
     }
@@ -650,6 +656,154 @@ fn hostile_files_are_refused_in_one_line() {
     );
     let nowhere = ["flakes", "-o", "no/where.exr"];
     fails(folder.path(), &nowhere, 1, &["no/where.exr", "does not exist"]);
+}
+
+/// An environment map of 64 x 33 pixels, `studio.exr`: dim grey, and a red rectangle around +x, up to 45 degrees high.
+fn folder_with_studio() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let picture = image::Rgb32FImage::from_fn(64, 33, |column, row| {
+        let red = (12..20).contains(&column) && (8..17).contains(&row);
+        image::Rgb(if red { [20.0, 0.2, 0.2] } else { [0.2; 3] })
+    });
+    picture.save(folder.path().join("studio.exr")).unwrap();
+    folder
+}
+
+#[test]
+fn an_environment_becomes_lobes_with_its_light() {
+    let folder = folder_with_studio();
+    let arguments = ["environment", "studio.exr", "--lobes", "16", "-o", "fit.json"];
+    let report = json(
+        folder.path(),
+        &[&arguments[..], &["--picture", "fit.exr", "--json"]].concat(),
+    );
+    assert_eq!((&report["lobes"], &report["width"]), (&16.into(), &64.into()));
+    assert!((0.005..0.3).contains(&number(&report["residual"])), "{report}");
+    assert_eq!(files(folder.path()), ["fit.exr", "fit.json", "studio.exr"]);
+    let text = std::fs::read_to_string(folder.path().join("fit.json")).unwrap();
+    let fit: Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(
+        (&fit["version"], &fit["map"]["name"]),
+        (&1.into(), &"studio.exr".into())
+    );
+    assert_eq!(fit["map"]["crc32"], report["crc32"]);
+    let lobes = fit["lobes"].as_array().unwrap();
+    let sum = |channel: usize| {
+        lobes
+            .iter()
+            .map(|lobe| number(&lobe["energy"][channel]))
+            .sum::<f64>()
+    };
+    // Green is 0.2 all over the sphere; the picture of the fit has the same light as the lobes, in all colours.
+    assert!(
+        (sum(1) / (0.8 * std::f64::consts::PI) - 1.0).abs() < 1e-5,
+        "{}",
+        sum(1)
+    );
+    let picture = image::open(folder.path().join("fit.exr")).unwrap().into_rgb32f();
+    assert_eq!(picture.dimensions(), (64, 33));
+    let (mut light, mut left) = ([0.0; 3], 0.0);
+    for (column, row, pixel) in picture.enumerate_pixels() {
+        let theta = std::f64::consts::PI * f64::from(row) / 32.0;
+        let solid_angle = theta.sin() * std::f64::consts::PI.powi(2) / (32.0 * 32.0);
+        for (sum, value) in light.iter_mut().zip(pixel.0) {
+            *sum += f64::from(value) * solid_angle;
+        }
+        left += if column < 32 {
+            f64::from(pixel.0[0]) * solid_angle
+        } else {
+            0.0
+        };
+    }
+    for (channel, light) in light.into_iter().enumerate() {
+        assert!((light / sum(channel) - 1.0).abs() < 0.01, "{channel}: {light}");
+    }
+    assert!(left > 0.9 * light[0], "{left} {light:?}");
+    // The brightest lobe points to the rectangle.
+    let red = |lobe: &&Value| number(&lobe["energy"][0]);
+    let brightest = lobes.iter().max_by(|a, b| red(a).total_cmp(&red(b))).unwrap();
+    let axis = [0, 1, 2].map(|i| number(&brightest["axis"][i]));
+    assert!(axis[0] > 0.7 && axis[1] > 0.0 && axis[2].abs() < 0.5, "{axis:?}");
+    let text = succeeds(folder.path(), &[&arguments[..], &["--force"]].concat());
+    assert!(
+        text.contains("16, fitted in") && text.contains("fit.json"),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_picture_shows_the_map_above_the_fit() {
+    let folder = folder_with_studio();
+    let arguments = [
+        "environment",
+        "studio.exr",
+        "--lobes",
+        "32",
+        "--picture",
+        "fit.png",
+    ];
+    succeeds(folder.path(), &arguments);
+    let picture = image::open(folder.path().join("fit.png")).unwrap().into_rgb8();
+    assert_eq!(picture.width(), 64);
+    let [gap, rows] = [picture.height() - 66, 33];
+    for top in [0, rows + gap] {
+        let [lamp, dim] = [
+            picture.get_pixel(16, top + 12).0,
+            picture.get_pixel(48, top + 12).0,
+        ];
+        assert!(lamp[0] > 200 && lamp[0] > 2 * lamp[1], "{lamp:?}");
+        assert!(dim[0] < 160 && dim[0].abs_diff(dim[1]) < 30, "{dim:?}");
+    }
+}
+
+#[test]
+fn wrong_environments_are_refused() {
+    let folder = folder_with_studio();
+    let at = folder.path();
+    let run = |status, arguments: &[&str], words: &[&str]| {
+        fails(at, &[&["environment"], arguments].concat(), status, words);
+    };
+    run(2, &["studio.exr"], &["--output", "--picture"]);
+    run(
+        2,
+        &["studio.exr", "-o", "fit.exr"],
+        &["fit.exr", ".json", "--picture"],
+    );
+    run(2, &["studio.exr", "--picture", "fit.jpg"], &["fit.jpg", ".png"]);
+    for lobes in ["0", "1025"] {
+        let words = ["lobes", "[1, 1024]"];
+        run(2, &["studio.exr", "-o", "fit.json", "--lobes", lobes], &words);
+    }
+    run(1, &["no.exr", "-o", "fit.json"], &["no.exr"]);
+    run(
+        1,
+        &["studio.exr", "--picture", "studio.exr", "--force"],
+        &["studio.exr", "read"],
+    );
+    std::fs::write(at.join("fit.json"), "mine").unwrap();
+    run(1, &["studio.exr", "-o", "fit.json"], &["fit.json", "--force"]);
+    image::RgbImage::new(8, 4).save(at.join("low.png")).unwrap();
+    run(1, &["low.png", "-o", "a.json"], &["low.png", "EXR"]);
+    let save = |name: &str, value: f32| {
+        let picture = image::Rgb32FImage::from_pixel(8, 4, image::Rgb([1.0, value, 1.0]));
+        picture.save(at.join(name)).unwrap();
+    };
+    save("nan.exr", f32::NAN);
+    run(
+        1,
+        &["nan.exr", "-o", "a.json"],
+        &["nan.exr", "column 0, row 0", "finite"],
+    );
+    save("negative.exr", -1.0);
+    run(
+        1,
+        &["negative.exr", "-o", "a.json"],
+        &["negative.exr", "not negative"],
+    );
+    image::Rgb32FImage::new(8, 4).save(at.join("black.exr")).unwrap();
+    run(2, &["black.exr", "-o", "a.json"], &["black"]);
+    assert_eq!(std::fs::read_to_string(at.join("fit.json")).unwrap(), "mine");
+    assert!(!at.join("a.json").exists());
 }
 
 #[test]

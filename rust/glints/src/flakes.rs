@@ -4,7 +4,7 @@
 use glam::{Vec2, Vec3};
 
 use crate::half_vector::DirectionPair;
-use crate::lobe_range::lobe_integral;
+use crate::lobe_range::{flat_lobe_integral, lobe_integral};
 use crate::methods::Reflection;
 use crate::microfacet::Flake;
 
@@ -58,6 +58,11 @@ impl FlakeModel {
     /// The term of the integral of [`FlakeModel::ndf`] over a rectangle of the projected disk.
     pub fn ndf_integral(&self, t: Vec3, weight: f32, low: Vec2, high: Vec2) -> f64 {
         f64::from(self.share(weight, t)) * lobe_integral(&self.flake, t, low, high)
+    }
+
+    /// The same by [`flat_lobe_integral`], for sums over many flakes.
+    pub fn flat_ndf_integral(&self, t: Vec3, weight: f32, low: Vec2, high: Vec2) -> f64 {
+        f64::from(self.share(weight, t)) * flat_lobe_integral(&self.flake, t, low, high)
     }
 
     /// The term of the half vector's density.

@@ -12,6 +12,8 @@
 mod array;
 pub mod brdf;
 mod container;
+pub mod environment_file;
+pub mod environment_map;
 pub mod error;
 pub mod flake_layer;
 pub mod flake_map;

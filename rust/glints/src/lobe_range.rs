@@ -18,6 +18,8 @@
 //! integrand has the shape of a square root. Beckmann's lobe is cut at [`BECKMANN_EXTENT`] alpha, of which 4e-9
 //! are left out.
 
+use std::f64::consts::{FRAC_1_SQRT_2, SQRT_2, TAU};
+
 use glam::{DVec2, DVec3, Vec2, Vec3};
 
 use crate::microfacet::{Distribution, Flake};
@@ -27,6 +29,9 @@ const BECKMANN_EXTENT: f64 = 4.4;
 
 /// Widths in units of alpha between which panels of the quadrature over a GGX lobe lie.
 const GGX_PANELS: [f64; 6] = [1.5, 6.0, 24.0, 96.0, 384.0, 1536.0];
+
+/// Largest roughness of a lobe that is taken as flat.
+const FLAT_ALPHA: f32 = 0.05;
 
 /// Nodes of a panel of the quadrature.
 const NODES: usize = 12;
@@ -53,6 +58,36 @@ pub fn lobe_integral(flake: &Flake, t: Vec3, low: Vec2, high: Vec2) -> f64 {
         return lobe.t.z;
     }
     lobe.integral(low, high)
+}
+
+/// [`lobe_integral`] within 0.02 of the lobe, at a small part of its time: for sums over many flakes.
+///
+/// A narrow lobe is a Gaussian on the disk, too: half vectors are `t + s1 e1 + s2 e2` to first order, whose x and y have
+/// the covariance `alpha^2 / 2 (1 - t t^T)` and the correlation `rho`. The probability of a rectangle is taken to first order
+/// in `rho` (Plackett 1954: `d P / d rho` is the bivariate density). Wide lobes, those that lean by more than 45 degrees,
+/// and GGX are integrated as above.
+pub fn flat_lobe_integral(flake: &Flake, t: Vec3, low: Vec2, high: Vec2) -> f64 {
+    if flake.kind() != Distribution::Beckmann || flake.alpha() > FLAT_ALPHA || t.z * t.z < 0.5 {
+        return lobe_integral(flake, t, low, high);
+    }
+    let centre = t.truncate().as_dvec2();
+    let lean = DVec2::ONE - centre * centre;
+    let deviation = DVec2::new(lean.x.sqrt(), lean.y.sqrt()) * (f64::from(flake.alpha()) * FRAC_1_SQRT_2);
+    let (low, high) = (
+        (low.as_dvec2() - centre) / deviation,
+        (high.as_dvec2() - centre) / deviation,
+    );
+    let reach = DVec2::splat(BECKMANN_EXTENT * SQRT_2);
+    if !(low.cmplt(high) & low.cmplt(reach) & high.cmpgt(-reach)).all() {
+        return 0.0;
+    }
+    let probability =
+        |low: f64, high: f64| 0.5 * (libm::erf(high * FRAC_1_SQRT_2) - libm::erf(low * FRAC_1_SQRT_2));
+    let density = |x: f64| (-0.5 * x * x).exp();
+    let slope = (density(high.x) - density(low.x)) * (density(high.y) - density(low.y)) / TAU;
+    let correlation = -centre.x * centre.y / (lean.x * lean.y).sqrt();
+    let product = probability(low.x, high.x) * probability(low.y, high.y);
+    f64::from(t.z) * (product + correlation * slope).max(0.0)
 }
 
 /// A flake's lobe and the box on the disk outside of which it is zero.
@@ -217,6 +252,49 @@ mod tests {
             assert!(whole > 0.1);
             assert_relative_eq!(parts, whole, max_relative = 2e-3);
         }
+    }
+
+    #[test]
+    fn flat_lobes_are_close() {
+        let (mut worst, mut uncorrelated) = (0.0_f64, 0.0_f64);
+        for alpha in [0.002, 0.01, 0.05] {
+            let flake = Flake::new(Distribution::Beckmann, alpha).unwrap();
+            for t in [
+                Vec3::Z,
+                Vec3::new(0.3, -0.3, 1.0),
+                Vec3::new(0.6, 0.6, 1.0),
+                Vec3::new(-0.1, 0.9, 1.0),
+            ] {
+                let t = t.normalize();
+                for (low, high) in [
+                    (Vec2::splat(-0.5), Vec2::splat(0.5)),
+                    (Vec2::splat(0.0), Vec2::splat(3.0)),
+                    (Vec2::new(-3.0, 0.2), Vec2::new(-0.1, 4.0)),
+                    (Vec2::new(-9.0, -0.6), Vec2::new(0.3, 9.0)),
+                    (Vec2::splat(-9.0), Vec2::splat(9.0)),
+                    (Vec2::splat(7.0), Vec2::splat(9.0)),
+                ] {
+                    let (low, high) = (t.truncate() + alpha * low, t.truncate() + alpha * high);
+                    let expected = lobe_integral(&flake, t, low, high);
+                    worst = worst.max((flat_lobe_integral(&flake, t, low, high) - expected).abs());
+                    // Twin: the same lobe upright, without correlation.
+                    let shift = t.truncate();
+                    let upright = flat_lobe_integral(&flake, Vec3::Z, low - shift, high - shift);
+                    uncorrelated = uncorrelated.max((upright * f64::from(t.z) - expected).abs());
+                }
+            }
+        }
+        println!("flat lobes: {worst:.4}, upright ones {uncorrelated:.4}");
+        assert!(worst < 0.02 && uncorrelated > 0.04, "{worst} {uncorrelated}");
+        // Where it does not hold, the integral itself.
+        let leaning = Vec3::new(1.2, 0.0, 1.0).normalize();
+        for flake in flakes() {
+            let (low, high) = (leaning.truncate() - 0.01, leaning.truncate() + 0.005);
+            let expected = lobe_integral(&flake, leaning, low, high);
+            assert_eq!(flat_lobe_integral(&flake, leaning, low, high), expected);
+        }
+        let invalid = flat_lobe_integral(&flakes()[0], Vec3::Z, Vec2::splat(f32::NAN), Vec2::splat(1.0));
+        assert_eq!(invalid, 0.0);
     }
 
     #[test]

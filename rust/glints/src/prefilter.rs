@@ -93,6 +93,14 @@ impl Environment {
     pub fn mixture(&self) -> &SphericalGaussians {
         &self.mixture
     }
+
+    /// See [`SphericalGaussians::turned`].
+    pub fn turned(&self, axes: &Mat3) -> Self {
+        Self {
+            mixture: self.mixture.turned(axes),
+            ..self.clone()
+        }
+    }
 }
 
 /// What prefiltering needs of a BRDF besides the method's answers.

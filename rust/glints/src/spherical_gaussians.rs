@@ -19,7 +19,7 @@
 //!
 //! **Determinism** The directions are summed in fixed chunks, in order, whatever the number of threads.
 
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
@@ -193,6 +193,54 @@ impl SphericalGaussians {
             })
             .unzip();
         Self { lobes, weights }
+    }
+
+    /// Lobes of a fit made before, with their shares of the light.
+    ///
+    /// # Errors
+    /// Not as many weights as lobes; none or more than [`MAX_LOBES`]; axes that are not unit vectors; sharpness or weights
+    /// outside their domains, or weights that do not sum to one.
+    pub fn from_lobes(lobes: Vec<SphericalGaussian>, weights: Vec<f32>) -> Result<Self> {
+        let refuse = |name, value: String, reason: &str| Err(Error::parameter(name, value, reason));
+        if lobes.len() != weights.len() || !(1..=MAX_LOBES).contains(&lobes.len()) {
+            let value = format!("{} and {} weights", lobes.len(), weights.len());
+            return refuse("lobes", value, "must be 1 to 1024, each with its weight");
+        }
+        if let Some(lobe) = lobes.iter().find(|lobe| !lobe.axis.is_normalized()) {
+            return refuse("axis", lobe.axis.to_string(), "must be a unit vector");
+        }
+        let (least, most) = (SHARPNESS.0 as f32, SHARPNESS.1 as f32);
+        if let Some(lobe) = lobes
+            .iter()
+            .find(|lobe| !(least..=most).contains(&lobe.sharpness))
+        {
+            return refuse(
+                "sharpness",
+                lobe.sharpness.to_string(),
+                "must be in [0.001, 300000]",
+            );
+        }
+        if let Some(weight) = weights.iter().find(|&&w| !(w > 0.0 && w.is_finite())) {
+            return refuse("weight", weight.to_string(), "must be positive and finite");
+        }
+        let total: f64 = weights.iter().map(|&w| f64::from(w)).sum();
+        if (total - 1.0).abs() > 1e-3 {
+            return refuse("weight", total.to_string(), "must sum to one over the lobes");
+        }
+        Ok(Self { lobes, weights })
+    }
+
+    /// The same light in another frame; the columns of `axes` are where x, y and z are there: unit vectors at
+    /// right angles.
+    pub fn turned(&self, axes: &Mat3) -> Self {
+        let turn = |lobe: &SphericalGaussian| SphericalGaussian {
+            axis: (*axes * lobe.axis).normalize_or(Vec3::Z),
+            ..*lobe
+        };
+        Self {
+            lobes: self.lobes.iter().map(turn).collect(),
+            weights: self.weights.clone(),
+        }
     }
 
     /// The lobes; their integrals are one.

@@ -22,8 +22,8 @@
 //!
 //! **Small footprints** are the exact method's, a [`CompactBinMap`] of the same map, over the parallelogram that has the
 //! Gaussian's covariance. Its share fades out linearly while the footprint grows from half to all of the finest level's size:
-//! value, density and sampling are a mixture, continuous at both ends. Range queries, which average over directions, have the
-//! images only: there, smaller footprints are widened to the finest level's.
+//! value, density, sampling and range queries are a mixture, continuous at both ends. A range query sums the exact method's part
+//! texel by texel: there its cost grows with the footprint, up to the finest level's.
 //!
 //! **Reflection** The half vector stands for the normal of the flake, `t_k = h`, also in the shadowing of flakes:
 //! `R = D_P(h) G1(i, h) G1(o, h)`. Within a lobe the two differ by its width; the pixel's normals are not kept.
@@ -279,10 +279,18 @@ impl Method for Tensor {
         self.mixed(footprint, |f| self.exact.ndf(f, h), |ndf| ndf, h.truncate())
     }
 
-    /// By images alone: the exact method has no range queries, so that a footprint below the finest level's is widened to it.
+    /// The exact method's part of a footprint is summed texel by texel.
     fn ndf_over(&self, footprint: &Footprint, low: Vec2, high: Vec2) -> Option<f32> {
-        let images = select::images(&self.images.geometry, footprint, DEVIATION);
-        Some(self.images.mean(&images, low, high))
+        let selection = self.select(footprint);
+        let mut mean = 0.0;
+        if selection.exact > 0.0 {
+            let exact = of_equal_covariance(footprint);
+            mean += selection.exact * self.exact.mean_over_texels(&exact, low, high);
+        }
+        if selection.exact < 1.0 {
+            mean += (1.0 - selection.exact) * self.images.mean(&selection.images, low, high);
+        }
+        Some(mean)
     }
 
     /// `u[0]` chooses the exact method or an image, `u[1]` a block of the image, `u[2]` and `u[3]` rows and columns.

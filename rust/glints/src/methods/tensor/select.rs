@@ -51,11 +51,6 @@ pub fn select(geometry: &Geometry, footprint: &Footprint, deviation: f64) -> Sel
     Selection { images, exact }
 }
 
-/// The images alone: a footprint below the finest level's gets that level's.
-pub fn images(geometry: &Geometry, footprint: &Footprint, deviation: f64) -> Blend {
-    Taps::new(&GaussianFootprint::new(footprint, deviation)).blend(geometry, footprint.center())
-}
-
 fn add_nodes(level: &Level, position: DVec2, share: f64, images: &mut Blend) {
     for (row, y) in level.axes[1].neighbours(position.y) {
         for (column, x) in level.axes[0].neighbours(position.x) {

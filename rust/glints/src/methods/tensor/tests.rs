@@ -152,10 +152,21 @@ fn every_footprint_has_range_queries() {
         let whole = 4.0 * over(size, Vec2::splat(-1.0), Vec2::splat(1.0));
         assert_relative_eq!(whole, 1.0, epsilon = 0.03);
     }
+    // Below the images' footprints, the mean of what single directions have, and not the images'.
     let (low, high) = (Vec2::new(-0.1, 0.0), Vec2::new(0.1, 0.2));
-    let widened = over(4.0, low, high);
-    assert_relative_eq!(over(0.0, low, high), widened, max_relative = 0.01);
-    assert!((over(400.0, low, high) / widened - 1.0).abs() > 0.02);
+    const SIDE: usize = 100;
+    for size in [0.0, 0.5, 4.0, 12.0] {
+        let points = (0..SIDE * SIDE).map(|i| Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5));
+        let sum: f64 = points
+            .map(|p| {
+                let h = low + p / SIDE as f32 * (high - low);
+                f64::from(tensor.ndf(&footprint(size), h.extend((1.0 - h.length_squared()).sqrt())))
+            })
+            .sum();
+        let expected = sum / (SIDE * SIDE) as f64;
+        assert_relative_eq!(f64::from(over(size, low, high)), expected, max_relative = 0.04);
+    }
+    assert!((over(400.0, low, high) / over(0.5, low, high) - 1.0).abs() > 0.1);
 }
 
 /// Quadrature nodes with weights over [low, high], cut where the centres of pixels are.
