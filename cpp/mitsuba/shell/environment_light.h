@@ -157,7 +157,7 @@ private:
                 owner, options.file, 100. * residual, 100. * expected, options.saved->map_name());
     }
 
-    /// The radiances of an `envmap`, without `scale`, and without the column that repeats the first one.
+    /// The radiances of an `envmap`, without `scale`, and without the columns that continue it to the left and to the right.
     class Picture final : public mitsuba::TraversalCallback {
     public:
         uint32_t width = 0, height = 0;
@@ -170,13 +170,13 @@ private:
             if (name != "data" || type != typeid(Tensor))
                 return;
             auto &data = *static_cast<Tensor *>(value);
-            if (data.ndim() != 3 || data.shape(1) < 2 || data.shape(2) != 3)
+            if (data.ndim() != 3 || data.shape(1) < 4 || data.shape(2) != 3)
                 return;
             height = (uint32_t) data.shape(0);
-            width = (uint32_t) data.shape(1) - 1;
+            width = (uint32_t) data.shape(1) - 2;
             const Float *pixels = data.array().data();
             for (uint32_t row = 0; row < height; ++row) {
-                const Float *begin = pixels + 3 * size_t(row) * (width + 1);
+                const Float *begin = pixels + 3 * (size_t(row) * (width + 2) + 1);
                 rgb.insert(rgb.end(), begin, begin + 3 * width);
             }
         }

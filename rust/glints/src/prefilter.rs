@@ -33,6 +33,7 @@ use crate::error::{Error, Result};
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
 use crate::half_vector_range::half_vector_rectangle;
+use crate::methods::MAX_RANGES;
 use crate::microfacet::Flake;
 use crate::normal_map::NormalMap;
 use crate::spherical_gaussians::{MAX_LOBES, SphericalGaussian, SphericalGaussians};
@@ -41,7 +42,7 @@ use crate::spherical_gaussians::{MAX_LOBES, SphericalGaussian, SphericalGaussian
 const DEFENSIVE: f32 = 0.1;
 
 /// Most candidates of a draw.
-pub const MAX_CANDIDATES: usize = 64;
+pub const MAX_CANDIDATES: usize = MAX_RANGES;
 
 /// Least cosine of a half vector that the cheap NDF is evaluated at.
 const LEAST_COSINE: f32 = 0.05;
@@ -124,6 +125,15 @@ pub struct LobeSample {
     pub value: f32,
 }
 
+/// A lobe that was chosen and a direction from it, before the NDF is asked.
+struct Candidate {
+    lobe: usize,
+    pair: DirectionPair,
+    wo: Vec3,
+    /// The half vectors of the lobe's support; `None` where it lies below the horizon.
+    rectangle: Option<(Vec2, Vec2)>,
+}
+
 impl Prefilter {
     pub fn new(map: &NormalMap, flake: Flake) -> Self {
         let covariance = map.slope_covariance();
@@ -153,29 +163,33 @@ impl Prefilter {
         }
         let probabilities = self.probabilities(wi, to_local, environment)?;
         let count = environment.candidates;
-        let candidate = |index: u32| {
+        let draw = |index: u32| {
             // Strata for the lobes; an additive recurrence for the directions (Roberts 2018).
             let shifted = |u: f32, step: f32| (u + index as f32 * step).fract();
-            let u = [
-                (index as f32 + u[0]) / count as f32,
-                shifted(u[1], 0.754_877_7),
-                shifted(u[2], 0.569_840_3),
-            ];
-            let lobe = choose(&probabilities, u[0])?;
-            let (wo, value) = self.reflect(brdf, footprint, wi, to_local, environment, lobe, [u[1], u[2]])?;
-            Some(LobeSample {
+            let lobe = choose(&probabilities, (index as f32 + u[0]) / count as f32)?;
+            let local = local_lobe(&environment.mixture.lobes()[lobe], to_local);
+            let wo = local.sample([shifted(u[1], 0.754_877_7), shifted(u[2], 0.569_840_3)]);
+            Some(Candidate {
                 lobe,
-                probability: probabilities[lobe],
+                pair: DirectionPair::new(wi, wo)?,
                 wo,
-                value,
+                rectangle: half_vector_rectangle(wi, local.axis, environment.support_cos[lobe]),
             })
         };
+        let drawn: ArrayVec<Candidate, MAX_CANDIDATES> = (0..count).filter_map(draw).collect();
+        let values = self.values(brdf, footprint, wi, &drawn)?;
+        let candidates = drawn.iter().zip(values).map(|(candidate, value)| LobeSample {
+            lobe: candidate.lobe,
+            probability: probabilities[candidate.lobe],
+            wo: candidate.wo,
+            value,
+        });
+        let candidates: ArrayVec<LobeSample, MAX_CANDIDATES> = candidates.collect();
         if count == 1 {
-            return candidate(0);
+            return candidates.first().copied();
         }
         // The reflection of each, by the luminance of its lobe.
         let reflected = |s: &LobeSample| environment.mixture.weights()[s.lobe] * s.value / s.probability;
-        let candidates: ArrayVec<LobeSample, MAX_CANDIDATES> = (0..count).filter_map(candidate).collect();
         let total: f32 = candidates.iter().map(reflected).sum();
         let mut rest = four_uniforms(u)[0] * total;
         let mut visible = candidates.iter().filter(|s| s.value > 0.0);
@@ -189,41 +203,29 @@ impl Prefilter {
         Some(LobeSample { probability, ..*kept })
     }
 
-    /// A direction of the lobe, and its reflection.
-    #[allow(clippy::too_many_arguments)]
-    fn reflect(
+    /// The reflection of each candidate's lobe; one question about the NDF for all.
+    fn values(
         &self,
         brdf: &Brdf,
         footprint: &Footprint,
         wi: Vec3,
-        to_local: &Mat3,
-        environment: &Environment,
-        lobe: usize,
-        u: [f32; 2],
-    ) -> Option<(Vec3, f32)> {
-        let local = local_lobe(&environment.mixture.lobes()[lobe], to_local);
-        let wo = local.sample(u);
-        let pair = DirectionPair::new(wi, wo)?;
-        let value = match half_vector_rectangle(wi, local.axis, environment.support_cos[lobe]) {
-            Some((low, high)) => self.averaged(brdf, footprint, &pair, low, high)?,
-            None => brdf.evaluate(footprint, wi, wo).value,
+        candidates: &[Candidate],
+    ) -> Option<ArrayVec<f32, MAX_CANDIDATES>> {
+        let rectangles = candidates.iter().filter_map(|candidate| candidate.rectangle);
+        let rectangles: ArrayVec<(Vec2, Vec2), MAX_CANDIDATES> = rectangles.collect();
+        let mut means = brdf.method().ndf_over_all(footprint, &rectangles)?.into_iter();
+        let value = |candidate: &Candidate| match candidate.rectangle {
+            Some(rectangle) => Some(self.averaged(brdf, &candidate.pair, rectangle, means.next()?)),
+            None => Some(brdf.evaluate(footprint, wi, candidate.wo).value),
         };
-        Some((wo, value))
+        candidates.iter().map(value).collect()
     }
 
-    /// `G / (4 (i . n))` times the mean of the NDF over the part of the rectangle inside the disk.
-    fn averaged(
-        &self,
-        brdf: &Brdf,
-        footprint: &Footprint,
-        pair: &DirectionPair,
-        low: Vec2,
-        high: Vec2,
-    ) -> Option<f32> {
-        let mean = brdf.method().ndf_over(footprint, low, high)?;
+    /// `G / (4 (i . n))` times the mean of the NDF over the part of the rectangle inside the disk; `mean`: over all of it.
+    fn averaged(&self, brdf: &Brdf, pair: &DirectionPair, (low, high): (Vec2, Vec2), mean: f32) -> f32 {
         let flake = self.flake.smith_g1(pair.wi.dot(pair.half)) * self.flake.smith_g1(pair.wo.dot(pair.half));
         let inside = share_inside_disk(low, high);
-        Some(mean / inside * flake * brdf.masking(pair) / (4.0 * pair.wi.z))
+        mean / inside * flake * brdf.masking(pair) / (4.0 * pair.wi.z)
     }
 
     /// The probabilities of the lobes, which sum to one; `None` if no lobe has light above the horizon.

@@ -7,6 +7,7 @@ pub mod tensor;
 pub mod unfiltered;
 pub mod yan16;
 
+use arrayvec::ArrayVec;
 use glam::{Vec2, Vec3};
 
 use crate::footprint::Footprint;
@@ -51,6 +52,15 @@ pub trait Method: Send + Sync {
         None
     }
 
+    /// [`Method::ndf_over`] of several rectangles `(low, high)`, at most [`MAX_RANGES`] of them: a method may look at the
+    /// footprint once for all.
+    fn ndf_over_all(&self, footprint: &Footprint, rectangles: &[(Vec2, Vec2)]) -> Option<RangeMeans> {
+        let ranges = rectangles.iter().take(MAX_RANGES);
+        ranges
+            .map(|&(low, high)| self.ndf_over(footprint, low, high))
+            .collect()
+    }
+
     /// Draws a half vector: `u[0..2]` choose the point of the footprint, `u[2..4]` the normal of the flake
     /// there. `None`: the draw failed and counts as zero.
     fn sample(&self, footprint: &Footprint, u: [f32; 4]) -> Option<Vec3>;
@@ -74,6 +84,12 @@ pub trait Method: Send + Sync {
     /// The name under which people ask for the method.
     fn name(&self) -> &'static str;
 }
+
+/// Most rectangles of one question.
+pub const MAX_RANGES: usize = 64;
+
+/// What [`Method::ndf_over_all`] answers: one mean a rectangle.
+pub type RangeMeans = ArrayVec<f32, MAX_RANGES>;
 
 /// What [`Method::evaluate`] answers.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

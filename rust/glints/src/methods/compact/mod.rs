@@ -81,10 +81,11 @@ mod packing;
 mod strays;
 mod tiles;
 
+use arrayvec::ArrayVec;
 use glam::{Vec2, Vec3};
 use wide::f32x8;
 
-use super::{Method, Reflection, mean_over};
+use super::{MAX_RANGES, Method, RangeMeans, Reflection, mean_over};
 use crate::flakes::FlakeModel;
 use crate::footprint::Footprint;
 use crate::footprint_filter::{FilteredFootprint, FilteredPart, FootprintFilter, Window};
@@ -256,33 +257,37 @@ impl CompactBinMap {
         self.texels.normal((column, row))
     }
 
-    /// The mean of the NDF over a rectangle of the projected disk, as [`Method::ndf_over`] has it, summed over single texels:
-    /// for footprints of few. Of whole lobes, not of truncated ones; within 0.02 of each lobe.
-    pub fn mean_over_texels(&self, footprint: &Footprint, low: Vec2, high: Vec2) -> f32 {
-        mean_over(low, high, || {
-            let mut sum = 0.0;
-            let mut add = |column, row, weight: f64| {
-                let t = self.normal(column, row);
-                sum += self.model.flat_ndf_integral(t, weight as f32, low, high);
-            };
-            self.filter.over(footprint).for_each_part(|part| match part {
-                FilteredPart::Texel { column, row } => add(column, row, 1.0),
-                FilteredPart::Cut(window) => {
-                    for span in window.texel_spans(self.map.0, self.map.1) {
-                        let row = span.row as u32;
-                        for column in span.touched.0 as u32..span.touched.1 as u32 {
-                            add(column, row, window.texel_weight(column, row));
-                        }
+    /// The means of the NDF over rectangles of the projected disk, as [`Method::ndf_over_all`] has them, summed over single
+    /// texels: for footprints of few. Of whole lobes, not of truncated ones; within 0.02 of each lobe.
+    pub fn means_over_texels(&self, footprint: &Footprint, rectangles: &[(Vec2, Vec2)]) -> RangeMeans {
+        let ranges = rectangles.iter().take(MAX_RANGES);
+        let mut sums: ArrayVec<f64, MAX_RANGES> = ranges.clone().map(|_| 0.0).collect();
+        // A texel's normal takes longer to find than the part of a rectangle in its lobe.
+        let mut add = |column, row, weight: f64| {
+            let t = self.normal(column, row);
+            for (sum, &(low, high)) in sums.iter_mut().zip(rectangles) {
+                *sum += self.model.flat_ndf_integral(t, weight as f32, low, high);
+            }
+        };
+        self.filter.over(footprint).for_each_part(|part| match part {
+            FilteredPart::Texel { column, row } => add(column, row, 1.0),
+            FilteredPart::Cut(window) => {
+                for span in window.texel_spans(self.map.0, self.map.1) {
+                    let row = span.row as u32;
+                    for column in span.touched.0 as u32..span.touched.1 as u32 {
+                        add(column, row, window.texel_weight(column, row));
                     }
                 }
-                FilteredPart::Whole(weight) => {
-                    let texels =
-                        (0..self.map.1).flat_map(|row| (0..self.map.0).map(move |column| (column, row)));
-                    texels.for_each(|(column, row)| add(column, row, weight));
-                }
-            });
-            sum
-        })
+            }
+            FilteredPart::Whole(weight) => {
+                let texels = (0..self.map.1).flat_map(|row| (0..self.map.0).map(move |column| (column, row)));
+                texels.for_each(|(column, row)| add(column, row, weight));
+            }
+        });
+        let means = ranges.zip(sums);
+        means
+            .map(|(&(low, high), sum)| mean_over(low, high, || sum))
+            .collect()
     }
 
     /// Whether the nodes of a level of the tree can be taken as a whole.

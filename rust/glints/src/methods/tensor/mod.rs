@@ -48,7 +48,7 @@ mod select;
 use glam::{Vec2, Vec3};
 
 use super::compact::CompactBinMap;
-use super::{Method, Reflection};
+use super::{MAX_RANGES, Method, RangeMeans, Reflection};
 use crate::error::{Error, Result};
 use crate::flakes::{FlakeModel, Normalization};
 use crate::footprint::Footprint;
@@ -279,18 +279,27 @@ impl Method for Tensor {
         self.mixed(footprint, |f| self.exact.ndf(f, h), |ndf| ndf, h.truncate())
     }
 
-    /// The exact method's part of a footprint is summed texel by texel.
     fn ndf_over(&self, footprint: &Footprint, low: Vec2, high: Vec2) -> Option<f32> {
+        self.ndf_over_all(footprint, &[(low, high)])?.first().copied()
+    }
+
+    /// The exact method's part of a footprint is summed texel by texel.
+    fn ndf_over_all(&self, footprint: &Footprint, rectangles: &[(Vec2, Vec2)]) -> Option<RangeMeans> {
         let selection = self.select(footprint);
-        let mut mean = 0.0;
+        let mut means: RangeMeans = rectangles.iter().take(MAX_RANGES).map(|_| 0.0).collect();
         if selection.exact > 0.0 {
-            let exact = of_equal_covariance(footprint);
-            mean += selection.exact * self.exact.mean_over_texels(&exact, low, high);
+            let exact = self
+                .exact
+                .means_over_texels(&of_equal_covariance(footprint), rectangles);
+            let parts = means.iter_mut().zip(exact);
+            parts.for_each(|(mean, exact)| *mean += selection.exact * exact);
         }
         if selection.exact < 1.0 {
-            mean += (1.0 - selection.exact) * self.images.mean(&selection.images, low, high);
+            for (mean, &(low, high)) in means.iter_mut().zip(rectangles) {
+                *mean += (1.0 - selection.exact) * self.images.mean(&selection.images, low, high);
+            }
         }
-        Some(mean)
+        Some(means)
     }
 
     /// `u[0]` chooses the exact method or an image, `u[1]` a block of the image, `u[2]` and `u[3]` rows and columns.
