@@ -28,8 +28,8 @@ differentials. Otherwise it renders what `path` renders: on scenes without glint
 | `environment_   | boolean         | Light of the environment that glint BSDFs reflect is prefiltered (Section 5.4):   |
 | prefilter`      |                 | their NDF is averaged over the extent of a piece of the environment, instead of   |
 |                 |                 | being sampled. Far less noise, some bias. (Default: false)                        |
-| `environment_   | integer         | Number of those pieces, spherical Gaussians, at most 1024. More: less bias, more  |
-| lobes`          |                 | noise. (Default: 128)                                                             |
+| `environment_   | integer         | Number of those pieces, spherical Gaussians, at most 1024. More: finer shapes of  |
+| lobes`          |                 | lights, more time. (Default: 128)                                                 |
 | `environment_   | string          | Instead of `environment_lobes`: a fit that `glints environment` saved from the    |
 | file`           |                 | scene's environment map. Nothing is fitted then.                                  |
 | `environment_   | float           | A piece extends to where its Gaussian has so many times its peak, in (0, 1).      |
@@ -69,6 +69,23 @@ Environment prefiltering
   Other emitters, other materials and the visible background are as without prefiltering.
 - It needs range queries of the NDF: `glints_tensor`, `glints_direct` and `glints_unfiltered` have them, alone or in `twosided`.
   Other glint BSDFs are rendered unprefiltered, and a warning names them once.
+- Measured on two crops of 20 x 20 pixels of the project's kettle (a studio of softboxes and small lamps; `glints_tensor`,
+  `footprint` = `pixel`, 64 samples per pixel) against the unprefiltered image with 1536, in parts of the mean: mean bias, which
+  the reference knows to 1.4 % and 0.8 %, and the root mean square over pixels of bias and of noise. Of the bias, some 0.3 and 0.1
+  are the reference's noise. Without prefiltering, noise is 1.39 and 0.74.
+
+  | lobes | epsilon | mean bias       | rms bias   | noise      |
+  |-------|---------|-----------------|------------|------------|
+  | 32    | 0.3     | -3.8 %,  0.0 %  | 0.33, 0.15 | 0.10, 0.19 |
+  | 128   | 0.1     | -4.2 %, -4.7 %  | 0.37, 0.42 | 0.09, 0.15 |
+  | 128   | 0.2     | -4.0 %, -1.7 %  | 0.33, 0.08 | 0.10, 0.17 |
+  | 128   | 0.3     | -3.4 %, +0.8 %  | 0.32, 0.15 | 0.11, 0.19 |
+  | 128   | 0.6     | -2.7 %, +7.1 %  | 0.39, 0.72 | 0.11, 0.23 |
+  | 128   | 0.9     | -1.7 %, +13.1 % | 0.48, 1.17 | 0.13, 0.27 |
+  | 256   | 0.3     | -4.2 %, +0.7 %  | 0.32, 0.14 | 0.11, 0.19 |
+
+  So epsilon may be 0.2 to 0.3 (a box of the Gaussian's variance has 0.22): less spreads lights, more makes them points. The
+  number of lobes hardly matters here, as every small lamp has its own with 32 already.
 - Use it where glints reflect windows, softboxes and skies that are small against the whole of their lobe. It blurs the shapes of
   lights in nearly smooth metal: unsuitable where NDFs are narrower than the lights' pieces.
 

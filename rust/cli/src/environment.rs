@@ -42,7 +42,7 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE")]
     picture: Option<PathBuf>,
 
-    /// Number of spherical Gaussians, in 1 to 1024; `glints_path` has less bias with more, and more noise
+    /// Number of spherical Gaussians, in 1 to 1024; more follow the shapes of lights better, and take more time
     #[arg(long, default_value_t = 128)]
     lobes: usize,
 
