@@ -236,7 +236,8 @@ METHODS = {
             "glints_tensor",
             None,
             environment_prefilter=True,
-            note="Prefiltered light: a sample of environment light stands for a range of directions, and so does the answer.",
+            note="Prefiltered light: a sample of environment light stands for a range of directions, and so does the answer. "
+            "Its times are without the fit of the environment, some seconds once a scene, as `glints environment` makes it.",
             **TENSOR,
         ),
         glints("glints_unfiltered", "Unfiltered", "glints_unfiltered", NORMALS_MEMORY),

@@ -115,14 +115,24 @@ class LoadedScene:
         to_world = mi.traverse(self.scene.sensors()[0])["to_world"]
         self.to_world = type(to_world)(to_world)
         self.pivots = {}
+        self.integrators = {}
 
     def render(self, view, lighting, spp, seed):
         """Render a `View`; returns a `Rendering`."""
         self.point_at(view)
-        integrator = lighting.load()
+        integrator = self.integrator(lighting)
         wall, processor = time.perf_counter(), time.process_time()
         image = np.array(mi.render(self.scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)
         return Rendering(image[..., :3], time.perf_counter() - wall, time.process_time() - processor)
+
+    def integrator(self, lighting):
+        """The integrator of a `Lighting`, made once and ready: with prefiltered light it fits the scene's environment at
+        its first sample, which takes seconds and is no rendering."""
+        if lighting not in self.integrators:
+            made = self.integrators[lighting] = lighting.load()
+            if lighting.environment_prefilter:
+                mi.render(self.scene, integrator=made, spp=1)
+        return self.integrators[lighting]
 
     def point_at(self, view):
         """Set the sensor to a view. The footprint of a crop stays that of its full frame."""
