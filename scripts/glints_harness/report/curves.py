@@ -123,7 +123,7 @@ def prefiltering_plots(results):
     quantities = {
         "rmse": ("RMSE (radiance)", lambda item: error_point(item, "rmse", "spp")),
         "relmse": ("relative MSE", lambda item: error_point(item, "relmse", "spp")),
-        "noise": ("standard deviation over seeds (radiance)", noise_point),
+        "noise": ("deviation over seeds (radiance)", noise_point),
     }
     return {
         quantity: plots.Plot(
