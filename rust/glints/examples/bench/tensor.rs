@@ -7,6 +7,9 @@
 //! * `tensor/ndf_error` relative L1 errors of distributions: of the finest level's images against the uncompressed pyramid
 //!   (`against` = `pyramid`; `params` has the mean squared error of a pixel), and over footprints on the map against the direct sum
 //!   under a Gaussian (`direct`).
+//! * `tensor/highlight_error` what of the latter is whose, at the same points: against the same queries of the uncompressed images
+//!   (`compression`), and these against the direct sum (`blend`). A flat surface under a distant light shows, pixel by pixel, the
+//!   distribution at one half vector each: the relative L1 error of its highlight is this one.
 //! * `tensor/eval`, `tensor/sample` processor time of a query, against one of a plain Beckmann microfacet BRDF;
 //!   `tensor/eval/growth` the worst over the first, of all footprints, from 61 texels to 1000 periods of the map.
 
@@ -21,7 +24,7 @@ use glints::footprint_filter::FootprintFilter;
 use glints::half_vector::DirectionPair;
 use glints::methods::Method;
 use glints::methods::direct::Direct;
-use glints::methods::tensor::{Options, Tensor};
+use glints::methods::tensor::{Options, Tensor, Uncompressed};
 use glints::microfacet::Flake;
 use glints::normal_map::NormalMap;
 use serde_json::{Value, json};
@@ -38,8 +41,9 @@ const TILINGS: [f64; 7] = [0.03, 0.1, 0.3, 1.0, 10.0, 100.0, 1000.0];
 
 pub fn measure(arguments: &Arguments, map: &NormalMap) -> Result<()> {
     for &alpha in &arguments.alpha {
+        let model = model(alpha)?;
+        let uncompressed = Uncompressed::new(map, model, &Options::default())?;
         for &rank in &arguments.ranks {
-            let model = model(alpha)?;
             let own = match arguments.published {
                 true => Options::published(),
                 false => Options::default(),
@@ -49,7 +53,7 @@ pub fn measure(arguments: &Arguments, map: &NormalMap) -> Result<()> {
                 "map": arguments.label, "side": map.width(), "alpha": alpha, "rank": rank, "published": arguments.published,
             });
             let tensor = precompute(map, model, &options, &params)?;
-            against_direct(map, model, &tensor, &params)?;
+            against_direct(map, model, &tensor, &uncompressed, &params)?;
             if Some(&rank) == arguments.ranks.last() {
                 costs(arguments, map, model.flake, tensor, &params)?;
             }
@@ -129,25 +133,31 @@ fn published(params: &Value) -> (f64, f64) {
     }
 }
 
-fn against_direct(map: &NormalMap, model: FlakeModel, tensor: &Tensor, params: &Value) -> Result<()> {
+fn against_direct(
+    map: &NormalMap,
+    model: FlakeModel,
+    tensor: &Tensor,
+    uncompressed: &Uncompressed,
+    params: &Value,
+) -> Result<()> {
     let direct = Direct::with_filter(map.clone(), model, FootprintFilter::gaussian(0.5)?);
     for width in WIDTHS {
         let cell: Cell = width
             .to_string()
             .parse()
             .unwrap_or_else(|_| unreachable!("a number"));
-        let error = crate::error::of_distribution(tensor, &direct, &cell);
-        let params = with(
-            params,
-            &[("against", json!("direct")), ("footprint", json!(width))],
-        );
-        print(
-            "tensor/ndf_error",
-            error,
-            "relative L1",
-            ("all of it", 1.0),
-            &params,
-        );
+        let [total, compression, blend] = crate::error::of_tensor(tensor, uncompressed, &direct, &cell);
+        for (name, against, error) in [
+            ("tensor/ndf_error", "direct", total),
+            ("tensor/highlight_error", "compression", compression),
+            ("tensor/highlight_error", "blend", blend),
+        ] {
+            let params = with(
+                params,
+                &[("against", json!(against)), ("footprint", json!(width))],
+            );
+            print(name, error, "relative L1", ("all of it", 1.0), &params);
+        }
     }
     Ok(())
 }

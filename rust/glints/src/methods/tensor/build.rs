@@ -5,9 +5,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rayon::prelude::*;
 
 use super::cp::{self, Tensor};
-use super::images::{Group, Images, LARGEST_FACTOR, LARGEST_ROW, Members, PADDING, Parts};
+use super::images::{Group, Images, Members, PADDING, Parts};
 use super::lobe::Lobes;
 use super::pyramid::{Geometry, Pyramid};
+use super::quantise::{Quantised, quantise};
 use super::{BLOCK, Options, PIXELS};
 use crate::normal_map::NormalMap;
 
@@ -39,11 +40,7 @@ struct Compressed {
     block: u16,
     /// Images that have a row.
     images: Vec<u32>,
-    rank: usize,
-    scales: Vec<f32>,
-    /// Prefix sums of rows and columns, component by component side by side.
-    prefixes: Vec<i16>,
-    rows: Vec<i16>,
+    vectors: Quantised,
     squared_error: f64,
     square: f64,
     iterations: u64,
@@ -286,100 +283,26 @@ fn compress(
         ),
         ref ranks => cp::decompose_to(&tensor, ranks, options.error.into(), &options.solver),
     };
-    let images = present.iter().map(|&(image, _)| image).collect();
-    let mut group = quantised(&result.factors, result.rank, images);
-    group.region = region;
-    group.block = block as u16;
-    group.square = square;
-    group.squared_error = square * result.relative_error.powi(2);
-    group.iterations = result.iterations as u64;
-    let found = group.reconstructed();
-    group.errors = errors(
+    let vectors = quantise(&result.factors, result.rank, &values, options.solver.ridge);
+    let found = vectors.reconstructed();
+    let errors = errors(
         geometry,
         present
             .iter()
             .zip(found.chunks_exact(PIXELS))
             .map(|((image, pixels), found)| (*image, *pixels, found)),
     );
-    (lost, Some(group))
-}
-
-/// Every component's vectors, each with the largest integer range it may have.
-fn quantised(factors: &[Vec<f32>; 3], rank: usize, images: Vec<u32>) -> Compressed {
-    let mut scales = vec![1.0_f32; rank];
-    let mut quantise = |factor: &[f32], largest: f32| {
-        let mut values = vec![0_i16; factor.len()];
-        for r in 0..rank {
-            let component = || factor[r..].iter().step_by(rank);
-            let peak = component().fold(0.0_f32, |peak, v| peak.max(v.abs()));
-            scales[r] *= peak / largest;
-            if peak > 0.0 {
-                for (value, f) in values[r..].iter_mut().step_by(rank).zip(component()) {
-                    *value = (f / peak * largest).round() as i16;
-                }
-            }
-        }
-        values
+    let group = Compressed {
+        region,
+        block: block as u16,
+        images: present.iter().map(|&(image, _)| image).collect(),
+        vectors,
+        squared_error: square * result.relative_error.powi(2),
+        square,
+        iterations: result.iterations as u64,
+        errors,
     };
-    let mut prefixes = Vec::new();
-    // Rows first; the solver has columns first.
-    for axis in [1, 0] {
-        let values = quantise(&factors[axis], LARGEST_FACTOR);
-        let start = prefixes.len();
-        prefixes.extend(values);
-        for i in start + rank..prefixes.len() {
-            prefixes[i] += prefixes[i - rank];
-        }
-    }
-    let rows = quantise(&factors[2], LARGEST_ROW);
-    for scale in &mut scales {
-        if !scale.is_finite() {
-            *scale = 0.0;
-        }
-    }
-    Compressed {
-        region: 0,
-        block: 0,
-        images,
-        rank,
-        scales,
-        prefixes,
-        rows,
-        squared_error: 0.0,
-        square: 0.0,
-        iterations: 0,
-        errors: Vec::new(),
-    }
-}
-
-impl Compressed {
-    /// What counts of all pixels, row after row of Z.
-    fn reconstructed(&self) -> Vec<f32> {
-        let rank = self.rank;
-        let line = |axis: usize, i: usize, r: usize| {
-            let at = |i: usize| f32::from(self.prefixes[(axis * BLOCK + i) * rank + r]);
-            if i == 0 { at(0) } else { at(i) - at(i - 1) }
-        };
-        // Products of rows and columns, component by component.
-        let mut products = vec![0.0; rank * PIXELS];
-        for (r, products) in products.chunks_exact_mut(PIXELS).enumerate() {
-            for (pixel, product) in products.iter_mut().enumerate() {
-                *product = self.scales[r] * line(0, pixel / BLOCK, r) * line(1, pixel % BLOCK, r);
-            }
-        }
-        let mut values = vec![0.0; self.images.len() * PIXELS];
-        for (values, row) in values.chunks_exact_mut(PIXELS).zip(self.rows.chunks_exact(rank)) {
-            for (products, &z) in products.chunks_exact(PIXELS).zip(row) {
-                let z = f32::from(z);
-                values
-                    .iter_mut()
-                    .zip(products)
-                    .for_each(|(value, p)| *value += z * p);
-            }
-            values.iter_mut().for_each(|value| *value = value.max(0.0));
-        }
-        values
-    }
+    (lost, Some(group))
 }
 
 /// One array of each kind for all groups, as far as their images are kept.
@@ -395,6 +318,7 @@ fn assemble(geometry: Geometry, groups: Vec<Compressed>) -> Images {
         if kept == 0 {
             continue;
         }
+        let vectors = &group.vectors;
         let mut mask = vec![0_u64; members.words];
         for &image in &group.images[..kept] {
             let local = members.local[image as usize] as usize;
@@ -406,19 +330,19 @@ fn assemble(geometry: Geometry, groups: Vec<Compressed>) -> Images {
                 scales: scales.len() as u32,
                 block: group.block,
                 region: group.region,
-                rank: group.rank as u8,
+                rank: vectors.rank as u8,
             }
             .packed(),
         );
         masks.extend(mask);
-        factors.extend(group.prefixes);
-        factors.extend(&group.rows[..kept * group.rank]);
-        let end = scales.len() + super::images::scales(group.rank);
-        scales.extend(group.scales);
-        scales.resize(end, 0.0);
+        factors.extend(&vectors.factors);
+        factors.extend(&vectors.rows[..kept * vectors.rank]);
+        let end = scales.len() + super::images::scales(vectors.rank);
+        scales.extend(&vectors.scales);
+        scales.resize(end, 0);
     }
     factors.extend([0; PADDING]);
-    scales.extend([0.0; PADDING]);
+    scales.extend([0; PADDING]);
     let parts = Parts {
         groups: list.into(),
         masks: masks.into(),

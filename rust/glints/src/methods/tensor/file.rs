@@ -11,7 +11,7 @@
 //! | 5 | texels between the images of level 0 |
 //! | 6 | levels |
 //!
-//! and sections: groups (3 u32), masks (u64), factors (i16), scales (f32), masses (u16), totals (f32), see [`super::images`]; and the
+//! and sections: groups (3 u32), masks (u64), factors (i8), scales (u16), masses (u16), totals (f32), see [`super::images`]; and the
 //! map's normals, x and y in 16 bits each (2 u16), from which the exact method for small footprints is built when the file is
 //! loaded. So a file stands for its map.
 //!
@@ -24,6 +24,7 @@ use glam::{Vec2, Vec3};
 
 use super::images::{Group, Images, MAX_RANK, Members, PADDING, Parts};
 use super::pyramid::Geometry;
+use super::quantise::{LARGEST_SCALE, scale};
 use super::{Options, Report, Tensor};
 use crate::array::Array;
 use crate::container::{Checked, Contents, Kind, Section};
@@ -34,16 +35,13 @@ use crate::microfacet::{Distribution, Flake};
 use crate::normal_map::{MAX_SIDE, MIN_Z, NormalMap};
 
 /// The version that is written, and the only one that is read.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 const KIND: Kind = Kind {
     magic: *b"\x89GLTNSR\n",
     version: VERSION,
     made_by: "glints precompute tensor",
 };
-
-/// Largest scale: with it, all products are finite.
-const LARGEST_SCALE: f32 = 1.0;
 
 /// Totals of images with energy.
 const TOTALS: std::ops::RangeInclusive<f32> = 1e-3..=1e12;
@@ -377,7 +375,13 @@ fn check_parts(geometry: &Geometry, parts: &Parts) -> Checked<()> {
         parts.totals.iter().all(|t| *t == 0.0 || TOTALS.contains(t)),
         "a total",
     )?;
-    demand(parts.scales.iter().all(|s| s.abs() <= LARGEST_SCALE), "a scale")
+    demand(
+        parts
+            .scales
+            .iter()
+            .all(|&bits| (0.0..=LARGEST_SCALE).contains(&scale(bits))),
+        "a scale",
+    )
 }
 
 fn demand(holds: bool, what: &str) -> Checked<()> {

@@ -8,10 +8,9 @@
 //! c(i, j, z) = sum_r C_r Y_r(i) X_r(j) Z_r(z)                                              (Eq. 6)
 //! ```
 //!
-//! **Layout** of a group, 16-bit integers: prefix sums `S_r(i) = Y_r(0) + ... + Y_r(i)` for 16 rows, the same for 16 columns, then
-//! L rows of Z, every row with its R components side by side. The prefix sums are the summed-area tables of the published method,
-//! and its vectors, too: `Y_r(i) = S_r(i) - S_r(i - 1)`. With 12 bits for Y, a sum of sixteen never overflows, so that point
-//! and range queries read the same exact numbers and the tables cost nothing. `C_r` holds all scales, in single precision.
+//! **Layout** of a group, 8-bit integers: 16 rows of Y, 16 of X, then L rows of Z, every row with its R components side by side;
+//! `C_r` holds all scales, the upper half of an f32. Published are vectors and summed-area tables of them in floating point. Here
+//! sums over rows or columns are of at most sixteen integers each, exact ones, and take no memory.
 //! Which images have a row is a set of bits for each group; the row is the number of bits before the image's.
 //!
 //! **Values** A sum of rank R dips below zero. Every pixel counts as `max(c, 0)`, before anything is blended, and every image
@@ -28,21 +27,16 @@ use std::ops::Range;
 
 use arrayvec::ArrayVec;
 use glam::Vec2;
-use wide::{f32x8, i16x8, i32x8};
+use wide::f32x8;
 
 use super::pyramid::Geometry;
+use super::quantise::scale;
 use super::{BLOCK, PIXELS, REGIONS};
 use crate::array::Array;
 use crate::hash::mix;
 
 /// Largest rank.
 pub const MAX_RANK: usize = 64;
-
-/// Largest magnitude of a quantised Y or X: sixteen of them sum up to 16 bits.
-pub const LARGEST_FACTOR: f32 = 2047.0;
-
-/// Largest magnitude of a quantised Z.
-pub const LARGEST_ROW: f32 = 32_767.0;
 
 /// Elements after the last one of an array whose components are read as if there were [`MAX_RANK`].
 pub const PADDING: usize = MAX_RANK;
@@ -103,10 +97,10 @@ pub struct Parts {
     pub groups: Array<[u32; 3]>,
     /// Bits of the images of the region that have a row: [`Members::words`] words a group.
     pub masks: Array<u64>,
-    /// Prefix sums and rows, with padding.
-    pub factors: Array<i16>,
-    /// `C_r`, zero up to the next multiple of eight, with padding.
-    pub scales: Array<f32>,
+    /// Y, X and rows of Z, with padding.
+    pub factors: Array<i8>,
+    /// `C_r`, upper halves of f32, zero up to the next multiple of eight, with padding.
+    pub scales: Array<u16>,
     /// Shares of each image's blocks, image by image, blocks in order.
     pub masses: Array<u16>,
     /// Sum of what counts of each image, in densities: times the area of a pixel, its energy.
@@ -728,8 +722,8 @@ fn dot<const C: usize>(a: &Components<C>, b: &Components<C>) -> f32 {
 /// The arrays that queries read. Where a file is mapped, every look at an array checks its alignment: once a query is enough.
 #[derive(Clone, Copy)]
 struct Arrays<'a> {
-    factors: &'a [i16],
-    scales: &'a [f32],
+    factors: &'a [i8],
+    scales: &'a [u16],
 }
 
 impl<'a> Arrays<'a> {
@@ -749,38 +743,29 @@ impl<'a> Arrays<'a> {
             if 8 * c >= group.rank as usize {
                 return f32x8::ZERO;
             }
-            f32x8::from(std::array::from_fn(|k| values[8 * c + k]))
+            f32x8::from(std::array::from_fn(|k| scale(values[8 * c + k])))
         })
     }
 
     /// Line `line` of a group's factors, as integers.
     #[inline]
-    fn integers<const C: usize>(&self, group: &Group, line: usize) -> [i16x8; C] {
+    fn integers<const C: usize>(&self, group: &Group, line: usize) -> [[i8; 8]; C] {
         let first = group.factors as usize + line * group.rank as usize;
         let values = &self.factors[first..][..8 * C];
-        std::array::from_fn(|c| i16x8::from(std::array::from_fn(|k| values[8 * c + k])))
+        std::array::from_fn(|c| std::array::from_fn(|k| values[8 * c + k]))
     }
 
     /// The same as numbers.
     #[inline]
     fn line<const C: usize>(&self, group: &Group, line: usize) -> Components<C> {
-        self.integers(group, line).map(number)
+        self.integers(group, line)
+            .map(|values: [i8; 8]| f32x8::from(values.map(f32::from)))
     }
 
-    /// The sum of the first `i` of `Y` (axis 0) or `X` (axis 1).
-    #[inline]
-    fn prefix<const C: usize>(&self, group: &Group, axis: usize, i: usize) -> [i16x8; C] {
-        match i {
-            0 => [i16x8::ZERO; C],
-            i => self.integers(group, axis * BLOCK + i - 1),
-        }
-    }
-
-    /// `Y(i)` or `X(i)`.
+    /// `Y(i)` (axis 0) or `X(i)` (axis 1).
     #[inline]
     fn factor<const C: usize>(&self, group: &Group, axis: usize, i: usize) -> Components<C> {
-        let (below, above): ([_; C], [_; C]) = (self.prefix(group, axis, i), self.prefix(group, axis, i + 1));
-        std::array::from_fn(|c| number(above[c] - below[c]))
+        self.line(group, axis * BLOCK + i)
     }
 
     /// `C_r Y_r(i) X_r(j)` for the pixels of a corner: two rows of two columns.
@@ -799,13 +784,21 @@ impl<'a> Arrays<'a> {
         }
     }
 
-    /// The weighted sum of `Y` or `X` over an interval: two look-ups, and what is cut at the ends.
+    /// The weighted sum of `Y` or `X` over an interval.
     #[inline]
     fn sum<const C: usize>(&self, group: &Group, axis: usize, interval: &Interval) -> Components<C> {
-        let Range { start, end } = interval.whole;
-        let (below, above): ([_; C], [_; C]) =
-            (self.prefix(group, axis, start), self.prefix(group, axis, end));
-        let mut sum: Components<C> = std::array::from_fn(|c| number(above[c]) - number(below[c]));
+        let mut integers = [[0_i16; 8]; C];
+        for i in interval.whole.clone() {
+            for (sums, values) in integers
+                .iter_mut()
+                .zip(self.integers::<C>(group, axis * BLOCK + i))
+            {
+                for (sum, value) in sums.iter_mut().zip(values) {
+                    *sum += i16::from(value);
+                }
+            }
+        }
+        let mut sum = integers.map(|sums| f32x8::from(sums.map(f32::from)));
         for &(i, weight) in &interval.parts {
             let factor: Components<C> = self.factor(group, axis, i);
             for c in 0..C {
@@ -814,9 +807,4 @@ impl<'a> Arrays<'a> {
         }
         sum
     }
-}
-
-#[inline]
-fn number(integers: i16x8) -> f32x8 {
-    f32x8::from_i32x8(i32x8::from_i16x8(integers))
 }

@@ -15,7 +15,7 @@
 //! |---|---|
 //! | lobes of texels in images | [`lobe`] |
 //! | images for footprints of all places and sizes, a pyramid | [`pyramid`] |
-//! | groups of blocks, decomposed ([`cp`]) and quantised | [`build`] |
+//! | groups of blocks, decomposed ([`cp`]) and rounded ([`quantise`]) | [`build`] |
 //! | point queries, range queries, sampling | [`images`] |
 //! | footprints as blends of images | [`select`] |
 //! | files | [`file`] |
@@ -43,7 +43,9 @@ mod file;
 mod images;
 mod lobe;
 mod pyramid;
+mod quantise;
 mod select;
+mod uncompressed;
 
 use glam::{Vec2, Vec3};
 
@@ -60,6 +62,7 @@ use select::{Selection, select};
 
 pub use build::Report;
 pub use file::{Header, VERSION, cache_path, is_saved, read_header};
+pub use uncompressed::Uncompressed;
 
 /// Pixels per side of a block.
 const BLOCK: usize = 16;

@@ -363,3 +363,25 @@ fn precomputations_are_found_again() {
     assert!(cached(&map, &other).1.is_some());
     assert!(cached(&noisy_map(30, 40), &other).1.is_some());
 }
+
+#[test]
+fn the_error_against_uncompressed_images_is_the_ranks() {
+    let map = noisy_map(64, 48);
+    let uncompressed = Uncompressed::new(&map, model(), &small_options()).unwrap();
+    let difference = |rank| {
+        let options = Options {
+            rank,
+            ..small_options()
+        };
+        let (tensor, _) = Tensor::new(&map, model(), &options, &|_| ()).unwrap();
+        let (mut difference, mut sum) = (0.0, 0.0);
+        for p in points(2000) {
+            let expected = uncompressed.ndf(&footprint(40.0), half(p));
+            difference += (tensor.ndf(&footprint(40.0), half(p)) - expected).abs();
+            sum += expected;
+        }
+        difference / sum
+    };
+    let (low, high) = (difference(2), difference(32));
+    assert!(high < 0.01 && low > 5.0 * high, "{low} {high}");
+}
