@@ -159,6 +159,8 @@ pub struct Images {
     chunks: usize,
     /// Group of each region and block plus one, or zero.
     lookup: Vec<u32>,
+    /// First group of each region, and the end.
+    regions: Vec<u32>,
     /// First mass of each image, and the end.
     starts: Vec<u32>,
     /// `1 / total` of each image, zero for one without energy.
@@ -175,6 +177,15 @@ struct Corner {
     block: u32,
     rows: Line,
     columns: Line,
+}
+
+impl Corner {
+    /// Of its pixels; of those that are not the block's, zero.
+    #[inline]
+    fn weights(&self) -> [f32; 4] {
+        let ([top, bottom], [left, right]) = (self.rows.weights, self.columns.weights);
+        [top * left, top * right, bottom * left, bottom * right]
+    }
 }
 
 /// One or two pixels of a block along an axis.
@@ -233,6 +244,9 @@ impl Images {
                 .map(|group| (group.rank as usize).div_ceil(8).next_power_of_two())
                 .max()
                 .unwrap_or(1),
+            regions: (0..=REGIONS * REGIONS)
+                .map(|region| groups.partition_point(|g| u32::from(g.region) < region) as u32)
+                .collect(),
             groups,
             lookup,
             starts,
@@ -263,6 +277,7 @@ impl Images {
         self.parts.bytes()
             + size_of_val(&self.groups[..])
             + size_of_val(&self.lookup[..])
+            + size_of_val(&self.regions[..])
             + size_of_val(&self.starts[..])
             + size_of_val(&self.inv_totals[..])
             + size_of_val(&members.region[..])
@@ -279,17 +294,17 @@ impl Images {
 
     /// The blend's density per projected area at a point of the disk.
     pub fn density(&self, blend: &Blend, p: Vec2) -> f32 {
-        self.blended(blend, p, |value| value.max(0.0))
+        self.blended(blend, p, |values| values.max(f32x8::ZERO))
     }
 
     /// The same without clamping: what range queries average.
     #[cfg(test)]
     pub fn raw_density(&self, blend: &Blend, p: Vec2) -> f32 {
-        self.blended(blend, p, |value| value)
+        self.blended(blend, p, |values| values)
     }
 
     #[inline(always)]
-    fn blended(&self, blend: &Blend, p: Vec2, counts: impl Fn(f32) -> f32) -> f32 {
+    fn blended(&self, blend: &Blend, p: Vec2, counts: impl Fn(f32x8) -> f32x8) -> f32 {
         let corners = self.corners(p);
         let sum = match self.chunks {
             1 => self.sum_corners::<1>(blend, &corners, counts),
@@ -305,13 +320,18 @@ impl Images {
         &self,
         blend: &Blend,
         corners: &[Corner],
-        counts: impl Fn(f32) -> f32,
+        counts: impl Fn(f32x8) -> f32x8,
     ) -> f32 {
         let arrays = Arrays::new(&self.parts);
-        let mut sum = 0.0;
+        let mut sum = f32x8::ZERO;
+        // Two images' four pixels each, that a transposition adds up at once.
+        let mut pending = [f32x8::ZERO; 8];
+        let mut weights = [0.0; 8];
+        let mut half = 0;
         for corner in corners {
             let mut known = usize::MAX;
             let mut products = [[f32x8::ZERO; C]; 4];
+            let pixels = corner.weights();
             for &(image, weight) in blend {
                 let Some((index, row)) = self.find(image, corner.block) else {
                     continue;
@@ -322,22 +342,22 @@ impl Images {
                     arrays.multiply(group, corner, &mut products);
                 }
                 let z: Components<C> = arrays.line(group, 2 * BLOCK + row);
-                let mut value = 0.0;
-                for (i, wy) in corner.rows.weights.iter().enumerate().take(corner.rows.count) {
-                    for (j, wx) in corner
-                        .columns
-                        .weights
-                        .iter()
-                        .enumerate()
-                        .take(corner.columns.count)
-                    {
-                        value += wy * wx * counts(dot(&products[2 * i + j], &z));
-                    }
+                let share = weight * self.inv_total(image);
+                for (i, (products, pixel)) in products.iter().zip(pixels).enumerate() {
+                    pending[half + i] = product(products, &z);
+                    weights[half + i] = share * pixel;
                 }
-                sum += weight * self.inv_total(image) * value;
+                half = 4 - half;
+                if half == 0 {
+                    sum += counts(sums(pending)) * f32x8::from(weights);
+                }
             }
         }
-        sum
+        if half > 0 {
+            weights[4..].fill(0.0);
+            sum += counts(sums(pending)) * f32x8::from(weights);
+        }
+        sum.reduce_add()
     }
 
     /// One over an image's total; zero for one without energy.
@@ -363,7 +383,7 @@ impl Images {
         };
         let blend = std::iter::once((image, 1.0)).collect();
         let total = self.parts.totals[image as usize];
-        total * self.sum_corners::<8>(&blend, &[corner], |value| value)
+        total * self.sum_corners::<8>(&blend, &[corner], |values| values)
     }
 
     /// From shares of an image to densities: one over the area of a pixel.
@@ -549,8 +569,8 @@ impl Images {
     }
 
     fn groups_of(&self, region: u8) -> Range<usize> {
-        let first = self.groups.partition_point(|g| g.region < region);
-        first..self.groups.partition_point(|g| g.region <= region)
+        let [first, end] = [0, 1].map(|next| self.regions[region as usize + next] as usize);
+        first..end
     }
 
     /// What counts of all pixels of a block.
@@ -564,32 +584,38 @@ impl Images {
     }
 
     fn reconstruct_components<const C: usize>(&self, group: &Group, row: usize, pixels: &mut [f32; PIXELS]) {
+        /// Rows at a time: with two vectors of sums each, as many as registers hold.
+        const ROWS: usize = 4;
         let arrays = Arrays::new(&self.parts);
         let scales: Components<C> = arrays.scales(group);
         let z: Components<C> = arrays.line(group, 2 * BLOCK + row);
-        // Columns of one component side by side.
-        let mut x = [[[0.0_f32; BLOCK]; 8]; C];
-        for column in 0..BLOCK {
-            let values: Components<C> = arrays.factor(group, 1, column);
-            for (x, values) in x.iter_mut().zip(values) {
-                for (x, value) in x.iter_mut().zip(values.to_array()) {
-                    x[column] = value;
-                }
+        // Sixteen columns of one component side by side.
+        let mut x = [[[f32x8::ZERO; 2]; 8]; C];
+        for half in 0..2 {
+            let columns: [Components<C>; 8] =
+                std::array::from_fn(|column| arrays.factor(group, 1, 8 * half + column));
+            for (c, x) in x.iter_mut().enumerate() {
+                let columns = f32x8::transpose(columns.map(|column| column[c]));
+                x.iter_mut().zip(columns).for_each(|(x, values)| x[half] = values);
             }
         }
-        for (row, pixels) in pixels.chunks_exact_mut(BLOCK).enumerate() {
-            let y: Components<C> = arrays.factor(group, 0, row);
-            let mut sums = [f32x8::ZERO; 2];
+        for (block, pixels) in pixels.chunks_exact_mut(ROWS * BLOCK).enumerate() {
+            let y: [[[f32; 8]; C]; ROWS] = std::array::from_fn(|i| {
+                let y: Components<C> = arrays.factor(group, 0, ROWS * block + i);
+                std::array::from_fn(|c| (scales[c] * z[c] * y[c]).to_array())
+            });
+            let mut sums = [[f32x8::ZERO; 2]; ROWS];
             for c in 0..C {
-                let y = (scales[c] * z[c] * y[c]).to_array();
-                for (y, x) in y.into_iter().zip(&x[c]) {
-                    let half = |h: usize| f32x8::from(std::array::from_fn(|k| x[8 * h + k]));
-                    sums[0] += f32x8::splat(y) * half(0);
-                    sums[1] += f32x8::splat(y) * half(1);
+                for (lane, x) in x[c].iter().enumerate() {
+                    for (sums, y) in sums.iter_mut().zip(&y) {
+                        let y = f32x8::splat(y[c][lane]);
+                        sums[0] = y.mul_add(x[0], sums[0]);
+                        sums[1] = y.mul_add(x[1], sums[1]);
+                    }
                 }
             }
-            for (h, sum) in sums.into_iter().enumerate() {
-                pixels[8 * h..8 * h + 8].copy_from_slice(&sum.max(f32x8::ZERO).to_array());
+            for (half, sum) in sums.iter().flatten().enumerate() {
+                pixels[8 * half..8 * half + 8].copy_from_slice(&sum.max(f32x8::ZERO).to_array());
             }
         }
     }
@@ -712,11 +738,24 @@ impl Interval {
 
 #[inline]
 fn dot<const C: usize>(a: &Components<C>, b: &Components<C>) -> f32 {
+    product(a, b).reduce_add()
+}
+
+/// Lanes of a scalar product.
+#[inline]
+fn product<const C: usize>(a: &Components<C>, b: &Components<C>) -> f32x8 {
     let mut sum = f32x8::ZERO;
     for c in 0..C {
-        sum += a[c] * b[c];
+        sum = a[c].mul_add(b[c], sum);
     }
-    sum.reduce_add()
+    sum
+}
+
+/// The sum of each vector.
+#[inline]
+fn sums(vectors: [f32x8; 8]) -> f32x8 {
+    let [a, b, c, d, e, f, g, h] = f32x8::transpose(vectors);
+    ((a + b) + (c + d)) + ((e + f) + (g + h))
 }
 
 /// The arrays that queries read. Where a file is mapped, every look at an array checks its alignment: once a query is enough.

@@ -43,23 +43,29 @@ pub fn select(geometry: &Geometry, footprint: &Footprint, deviation: f64) -> Sel
     let finest = effective(geometry);
     let taps = Taps::new(&GaussianFootprint::new(footprint, deviation));
     let exact = ((finest - taps.sigma) / (0.5 * finest)).clamp(0.0, 1.0) as f32;
-    let images = if exact < 1.0 {
-        taps.blend(geometry, footprint.center())
-    } else {
-        Blend::new()
+    let mut selection = Selection {
+        images: Blend::new(),
+        exact,
     };
-    Selection { images, exact }
+    if exact < 1.0 {
+        taps.blend(geometry, footprint.center(), &mut selection.images);
+    }
+    selection
 }
 
-fn add_nodes(level: &Level, position: DVec2, share: f64, images: &mut Blend) {
+/// The nodes about a position with their weights, times `share`. Those of one position are all different; other positions' may be
+/// among the images already, if these are `shared`.
+#[inline]
+fn add_nodes(level: &Level, position: DVec2, share: f64, shared: bool, images: &mut Blend) {
+    let columns = level.axes[0].neighbours(position.x);
     for (row, y) in level.axes[1].neighbours(position.y) {
-        for (column, x) in level.axes[0].neighbours(position.x) {
+        for (column, x) in columns {
             let weight = (share * x * y) as f32;
             if weight <= 0.0 {
                 continue;
             }
             let image = level.image(column, row);
-            match images.iter_mut().find(|(i, _)| *i == image) {
+            match images.iter_mut().find(|(i, _)| shared && *i == image) {
                 Some((_, sum)) => *sum += weight,
                 None => images.push((image, weight)),
             }
@@ -75,21 +81,21 @@ struct Taps {
 
 impl Taps {
     /// The images of the taps about `center`, of the two levels about their size; weights sum to one.
-    fn blend(&self, geometry: &Geometry, center: DVec2) -> Blend {
+    #[inline]
+    fn blend(&self, geometry: &Geometry, center: DVec2, images: &mut Blend) {
         let last = (geometry.levels.len() - 1) as f64;
         let position = (self.sigma / effective(geometry)).log2().clamp(0.0, last);
         let (level, fraction) = (position.floor(), position - position.floor());
         let weight = 1.0 / self.offsets.len() as f64;
-        let mut images = Blend::new();
+        let shared = self.offsets.len() > 1;
         for (index, share) in [(level, 1.0 - fraction), (level + 1.0, fraction)] {
             if share > 0.0 {
                 let level = &geometry.levels[index as usize];
                 for offset in &self.offsets {
-                    add_nodes(level, center + *offset, weight * share, &mut images);
+                    add_nodes(level, center + *offset, weight * share, shared, images);
                 }
             }
         }
-        images
     }
 
     fn new(gaussian: &GaussianFootprint) -> Self {
