@@ -18,8 +18,8 @@ The common ones are documented in `glints_ibm.cpp`. `normalization` can only be 
 | `ndf_file`   | string  | Instead of `filename`, `alpha` and `distribution`: a file of `glints precompute tensor`.    |
 | `cache`      | string  | Folder of precomputations, named by the map's content and all parameters. It is made if it  |
 |              |         | does not exist. (Default: `mitsuba-glints` in `$XDG_CACHE_HOME`, or else in `~/.cache`)     |
-| `rank`       | integer | Largest rank of a group of blocks, 1 to 64: memory and time against accuracy. Discrete      |
-|              |         | flakes ask for 32. 0: 16. (Default: 0)                                                      |
+| `rank`       | integer | Largest rank of a group of blocks, 1 to 64: memory and time against accuracy. 0: 32, or 16  |
+|              |         | with `published`. (Default: 0)                                                              |
 | `rank_error` | float   | Relative error of a group of blocks at which a smaller rank is taken. 0: all groups have    |
 |              |         | `rank`. (Default: 0)                                                                        |
 | `resolution` | integer | Pixels per side of an image of the hemisphere, a multiple of 16. 0: 256, which resolves     |

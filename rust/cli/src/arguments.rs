@@ -120,9 +120,9 @@ impl FlakeArguments {
 /// Of tensor-decomposed distributions.
 #[derive(Args)]
 pub struct TensorOptions {
-    /// Largest rank of a group of blocks, 1 to 64: memory and time against accuracy; discrete flakes ask for 32
-    #[arg(long, default_value_t = 16)]
-    rank: u32,
+    /// Largest rank of a group of blocks, 1 to 64: memory and time against accuracy [default: 32, with --published 16]
+    #[arg(long)]
+    rank: Option<u32>,
 
     /// Relative error of a group at which a smaller rank is taken; 0: all groups have the same
     #[arg(long, value_name = "ERROR", default_value_t = 0.0)]
@@ -156,7 +156,7 @@ impl TensorOptions {
             false => tensor::Options::default(),
         };
         let options = tensor::Options {
-            rank: self.rank,
+            rank: self.rank.unwrap_or(own.rank),
             error: self.rank_error,
             stride: self.stride,
             resolution: self.resolution,

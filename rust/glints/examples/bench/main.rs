@@ -70,7 +70,7 @@ struct Arguments {
     #[arg(long, value_delimiter = ',', default_values_t = ["ibm".to_string(), "yan16".to_string()])]
     methods: Vec<String>,
     /// Ranks of the tensor decomposition; costs are measured with the last.
-    #[arg(long, value_delimiter = ',', default_values_t = [16])]
+    #[arg(long, value_delimiter = ',', default_values_t = [32])]
     ranks: Vec<u32>,
     /// Tensor decomposition with the published solver.
     #[arg(long)]

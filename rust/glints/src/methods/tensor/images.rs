@@ -79,6 +79,7 @@ impl Group {
         [self.factors, self.scales, rest]
     }
 
+    #[inline]
     pub fn unpacked([factors, scales, rest]: [u32; 3]) -> Self {
         Self {
             factors,
@@ -124,7 +125,7 @@ pub struct Members {
     pub region: Vec<u8>,
     /// Number of each image among those of its region.
     pub local: Vec<u16>,
-    /// Images of each region, in order.
+    /// Images of each region, in order. [`Images`] keeps none: queries do without.
     pub images: Vec<Vec<u32>>,
     /// Words of a group's mask.
     pub words: usize,
@@ -154,7 +155,6 @@ pub struct Images {
     pub geometry: Geometry,
     members: Members,
     parts: Parts,
-    groups: Vec<Group>,
     /// Vectors of eight components of the largest rank: 1, 2, 4 or 8.
     chunks: usize,
     /// Group of each region and block plus one, or zero.
@@ -163,8 +163,6 @@ pub struct Images {
     regions: Vec<u32>,
     /// First mass of each image, and the end.
     starts: Vec<u32>,
-    /// `1 / total` of each image, zero for one without energy.
-    inv_totals: Vec<f32>,
 }
 
 /// All components of something, in vectors of eight; C is as large as the largest rank asks for. Beyond a group's rank there is
@@ -207,7 +205,7 @@ struct Interval {
 impl Images {
     /// Parts that fit together: see [`super::check`].
     pub fn new(geometry: Geometry, parts: Parts) -> Self {
-        let members = Members::new(&geometry);
+        let mut members = Members::new(&geometry);
         let blocks = geometry.blocks().pow(2) as usize;
         let groups: Vec<Group> = parts
             .groups
@@ -230,11 +228,7 @@ impl Images {
                 Some(*sum)
             })
             .collect();
-        let inv_totals = parts
-            .totals
-            .iter()
-            .map(|&total| if total > 0.0 { 1.0 / total } else { 0.0 })
-            .collect();
+        members.images = Vec::new();
         Self {
             geometry,
             members,
@@ -247,10 +241,8 @@ impl Images {
             regions: (0..=REGIONS * REGIONS)
                 .map(|region| groups.partition_point(|g| u32::from(g.region) < region) as u32)
                 .collect(),
-            groups,
             lookup,
             starts,
-            inv_totals,
         }
     }
 
@@ -258,16 +250,20 @@ impl Images {
         &self.parts
     }
 
-    #[cfg(test)]
-    pub fn groups(&self) -> &[Group] {
-        &self.groups
+    /// All groups, in order.
+    pub fn groups(&self) -> impl Iterator<Item = Group> + '_ {
+        self.parts.groups.iter().map(|&packed| Group::unpacked(packed))
+    }
+
+    fn group(&self, index: usize) -> Group {
+        Group::unpacked(self.parts.groups[index])
     }
 
     /// The row of an image in a group, if it has one.
     #[cfg(test)]
     pub fn row_of(&self, group: usize, image: u32) -> Option<usize> {
         let local = self.members.local[image as usize] as usize;
-        let same = self.members.region[image as usize] == self.groups[group].region;
+        let same = self.members.region[image as usize] == self.group(group).region;
         (same && has(self.mask(group), local)).then(|| rank_of(self.mask(group), local))
     }
 
@@ -275,19 +271,16 @@ impl Images {
     pub fn bytes(&self) -> usize {
         let members = &self.members;
         self.parts.bytes()
-            + size_of_val(&self.groups[..])
             + size_of_val(&self.lookup[..])
             + size_of_val(&self.regions[..])
             + size_of_val(&self.starts[..])
-            + size_of_val(&self.inv_totals[..])
             + size_of_val(&members.region[..])
             + size_of_val(&members.local[..])
-            + 4 * members.region.len()
     }
 
     /// Ranks of all groups.
     pub fn ranks(&self) -> impl Iterator<Item = usize> + '_ {
-        self.groups.iter().map(|group| group.rank as usize)
+        self.groups().map(|group| group.rank as usize)
     }
 
     // ---- point queries --------------------------------------------------------------------------------------------------------
@@ -336,13 +329,13 @@ impl Images {
                 let Some((index, row)) = self.find(image, corner.block) else {
                     continue;
                 };
-                let group = &self.groups[index];
+                let group = &arrays.group(index);
                 if known != index {
                     known = index;
                     arrays.multiply(group, corner, &mut products);
                 }
                 let z: Components<C> = arrays.line(group, 2 * BLOCK + row);
-                let share = weight * self.inv_total(image);
+                let share = weight * arrays.inverse_total(image);
                 for (i, (products, pixel)) in products.iter().zip(pixels).enumerate() {
                     pending[half + i] = product(products, &z);
                     weights[half + i] = share * pixel;
@@ -358,12 +351,6 @@ impl Images {
             sum += counts(sums(pending)) * f32x8::from(weights);
         }
         sum.reduce_add()
-    }
-
-    /// One over an image's total; zero for one without energy.
-    #[inline]
-    fn inv_total(&self, image: u32) -> f32 {
-        self.inv_totals[image as usize]
     }
 
     /// The density of one image at a pixel as reconstructed, negative values included, not normalised.
@@ -493,7 +480,7 @@ impl Images {
             let Some((index, row)) = self.find(image, block) else {
                 continue;
             };
-            let group = &self.groups[index];
+            let group = &arrays.group(index);
             if known != index {
                 known = index;
                 let scales: Components<C> = arrays.scales(group);
@@ -501,7 +488,7 @@ impl Images {
                 let x: Components<C> = arrays.sum(group, 1, columns);
                 products = std::array::from_fn(|c| scales[c] * y[c] * x[c]);
             }
-            let share = dot(&products, &arrays.line(group, 2 * BLOCK + row)) * self.inv_total(image);
+            let share = dot(&products, &arrays.line(group, 2 * BLOCK + row)) * arrays.inverse_total(image);
             sum += f64::from(weight * share);
         }
         sum
@@ -546,7 +533,7 @@ impl Images {
                 left -= u32::from(mass);
             }
             let (index, mass) = chosen?;
-            let group = &self.groups[index];
+            let group = &self.group(index);
             self.reconstruct(group, rank_of(self.mask(index), local), &mut pixels);
             let sum: f32 = pixels.iter().sum();
             let z = mix(u64::from(u[1].to_bits()) << 32 | u64::from(u[2].to_bits()) ^ (draw << 16));
@@ -625,13 +612,14 @@ impl Images {
         let images = self.geometry.images as usize;
         let mut sums = vec![Vec::new(); images];
         let mut pixels = [0.0; PIXELS];
-        for (index, group) in self.groups.iter().enumerate() {
-            let present = self.members.images[group.region as usize]
+        let members = Members::new(&self.geometry);
+        for (index, group) in self.groups().enumerate() {
+            let present = members.images[group.region as usize]
                 .iter()
                 .enumerate()
                 .filter(|&(local, _)| has(self.mask(index), local));
             for (row, (_, &image)) in present.enumerate() {
-                self.reconstruct(group, row, &mut pixels);
+                self.reconstruct(&group, row, &mut pixels);
                 sums[image as usize].push(pixels.iter().sum::<f32>());
             }
         }
@@ -643,10 +631,6 @@ impl Images {
             .iter()
             .zip(&totals)
             .flat_map(|(sums, &total)| sums.iter().map(move |&sum| mass(sum, total)))
-            .collect();
-        self.inv_totals = totals
-            .iter()
-            .map(|&total| if total > 0.0 { 1.0 / total } else { 0.0 })
             .collect();
         self.parts.masses = masses.into();
         self.parts.totals = totals.into();
@@ -761,17 +745,33 @@ fn sums(vectors: [f32x8; 8]) -> f32x8 {
 /// The arrays that queries read. Where a file is mapped, every look at an array checks its alignment: once a query is enough.
 #[derive(Clone, Copy)]
 struct Arrays<'a> {
+    groups: &'a [[u32; 3]],
     factors: &'a [i8],
     scales: &'a [u16],
+    totals: &'a [f32],
 }
 
 impl<'a> Arrays<'a> {
     #[inline]
     fn new(parts: &'a Parts) -> Self {
         Self {
+            groups: &parts.groups,
             factors: &parts.factors,
             scales: &parts.scales,
+            totals: &parts.totals,
         }
+    }
+
+    #[inline]
+    fn group(&self, index: usize) -> Group {
+        Group::unpacked(self.groups[index])
+    }
+
+    /// One over an image's total; zero for one without energy.
+    #[inline]
+    fn inverse_total(&self, image: u32) -> f32 {
+        let total = self.totals[image as usize];
+        if total > 0.0 { 1.0 / total } else { 0.0 }
     }
 
     /// `C_r`; beyond the rank zero, as stored or here, so that no other factor has to end there.

@@ -70,11 +70,11 @@ fn values_are_those_of_the_factors() {
     let mut pixels = [0.0; PIXELS];
     let mut checked = 0;
     for image in [0, 17, images.geometry.images - 1] {
-        for (index, group) in images.groups().iter().enumerate() {
+        for (index, group) in images.groups().enumerate() {
             let Some(row) = images.row_of(index, image) else {
                 continue;
             };
-            images.reconstruct(group, row, &mut pixels);
+            images.reconstruct(&group, row, &mut pixels);
             for (i, &pixel) in pixels.iter().enumerate() {
                 let block = u32::from(group.block);
                 let column = block % 4 * 16 + i as u32 % 16;
