@@ -422,6 +422,24 @@ def parser():
     return result
 
 
+def parts(options, maps, scenes, assets, display):
+    """The records that are asked for, part by part as they are measured."""
+    say = display.say
+    if options.only in (None, "rust"):
+        sides = options.sides or (() if options.quick else (1024, 4096))
+        yield rust_records(maps, options.quick, sides, say)
+        yield scene_records(scenes, say)
+    if options.only in (None, "plugins"):
+        yield plugin_records(maps, options.quick, say)
+    if options.only in (None, "frames"):
+        size = options.res or (200 if options.quick else FULL_SIZE)
+        repeats = options.repeats or (1 if options.quick else 3)
+        yield frame_records(scenes, size, repeats, Lighting(max_depth=options.max_depth), display)
+    if options.only in (None, "tensor"):
+        yield tensor_table_records(options, say)
+        yield tensor_records(options, assets, say)
+
+
 def main(arguments=None):
     """Measure, print tables, write bench.json."""
     options = parser().parse_args(arguments)
@@ -432,21 +450,11 @@ def main(arguments=None):
     scenes = [scene for scene in find_scenes(options.scene_dir, ["all"], assets) if scene.reduced is None]
     records = []
     with Display() as display:
-        if options.only in (None, "rust"):
-            sides = options.sides or (() if options.quick else (1024, 4096))
-            records += rust_records(maps, options.quick, sides, display.say)
-            records += scene_records(scenes, display.say)
-        if options.only in (None, "plugins"):
-            records += plugin_records(maps, options.quick, display.say)
-        if options.only in (None, "frames"):
-            size = options.res or (200 if options.quick else FULL_SIZE)
-            repeats = options.repeats or (1 if options.quick else 3)
-            records += frame_records(scenes, size, repeats, Lighting(max_depth=options.max_depth), display)
-        if options.only in (None, "tensor"):
-            records += tensor_table_records(options, display.say)
-            records += tensor_records(options, assets, display.say)
+        for part in parts(options, maps, scenes, assets, display):
+            records += part
+            # What is measured stays, whatever happens to the parts to come.
+            write_json(options.out / "bench.json", records)
     print_tables(records)
-    write_json(options.out / "bench.json", records)
     write_json(options.out / "provenance.json", provenance.provenance())
     verdicts = [goal[1] for goal in map(target, records) if goal is not None]
     console.print(f"{sum(verdicts)} of {len(verdicts)} targets reached. {time.perf_counter() - start:.0f} s.")

@@ -41,7 +41,7 @@ STRIDE = 32
 RESOLUTION = 256
 """Pixels a side of an image, the default of `glints_tensor`."""
 
-PICTURE_SIDE, PICTURE_SPP = 400, 8
+PICTURE_SIDE, PICTURE_SPP = 256, 8
 """Pixels a side of the pictures, and the samples per pixel of each of two independent renderings."""
 
 TIMED_SPP = 16
@@ -53,12 +53,13 @@ NOT_COMPRESSED = replace(METHODS["glints_direct"], parameters={"footprint_filter
 FILE = "ranks.json"
 
 
+@dataclass(frozen=True)
 class OneTechnique:
     """Stock `direct` with one way of sampling: an integrator as `Lighting`."""
 
-    def __init__(self, name):
-        """`name`: eval (samples of the light only) or sample (of the BSDF only)."""
-        self.name = name
+    name: str
+    """eval (samples of the light only) or sample (of the BSDF only)."""
+    environment_prefilter: bool = False
 
     def load(self):
         """The Mitsuba integrator."""

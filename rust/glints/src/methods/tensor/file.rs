@@ -204,7 +204,7 @@ impl Tensor {
         folder: &Path,
         progress: &(dyn Fn(f64) + Sync),
     ) -> Result<(Self, Option<Report>)> {
-        super::check(model, options)?;
+        super::check(map, model, options)?;
         let path = cache_path(map, model, options, folder);
         if path.is_file() {
             return Ok((Self::load(&path)?.0, None));
@@ -295,7 +295,7 @@ impl Saved {
             stride,
             ..Options::default()
         };
-        options.check().map_err(|e| e.to_string())?;
+        options.check_for((width, height)).map_err(|e| e.to_string())?;
         let geometry = Geometry::new((width, height), resolution, stride);
         demand(
             (1..=geometry.levels.len()).contains(&(levels as usize)),

@@ -74,6 +74,7 @@ use crate::half_vector::DirectionPair;
 use crate::normal_map::NormalMap;
 use images::{Images, MAX_RANK};
 use lobe::Lobes;
+use pyramid::Geometry;
 use select::{Selection, select};
 
 pub use build::Report;
@@ -91,6 +92,9 @@ const REGIONS: u32 = 8;
 
 /// Standard deviation of the Gaussian footprint in pixels, as in [`super::yan16`].
 const DEVIATION: f64 = 0.5;
+
+/// Most images, of all levels: those of a region, a 64th of them, are numbered with 16 bits.
+const MOST_IMAGES: u32 = 1 << 21;
 
 /// Parameters of the precomputation.
 #[derive(Clone, Debug)]
@@ -165,6 +169,21 @@ impl Options {
         Ok(())
     }
 
+    /// # Errors
+    /// As [`Self::check`]; or there would be too many images of a map of this size.
+    fn check_for(&self, map: (u32, u32)) -> Result<()> {
+        self.check()?;
+        let images = Geometry::new(map, self.resolution, self.stride).images;
+        if images > MOST_IMAGES {
+            let reason = format!(
+                "asks for {images} images of a map of {} x {} texels, more than {MOST_IMAGES}; take a larger one",
+                map.0, map.1
+            );
+            return Err(Error::parameter("stride", self.stride, reason));
+        }
+        Ok(())
+    }
+
     /// The ranks that are tried for a group.
     fn ranks(&self) -> Vec<usize> {
         let largest = self.rank as usize;
@@ -194,7 +213,7 @@ impl Tensor {
         options: &Options,
         progress: &(dyn Fn(f64) + Sync),
     ) -> Result<(Self, Report)> {
-        check(model, options)?;
+        check(map, model, options)?;
         let lobes = Lobes::new(&model.flake, options.resolution);
         let (images, report) = build::build(map, lobes, options, progress);
         // As a file holds it, so that what is loaded answers as what was saved.
@@ -254,12 +273,12 @@ impl Tensor {
     }
 }
 
-fn check(model: FlakeModel, options: &Options) -> Result<()> {
+fn check(map: &NormalMap, model: FlakeModel, options: &Options) -> Result<()> {
     if model.normalization != Normalization::Projected {
         let reason = "a position-normal distribution is one of projected area; leave the parameter out";
         return Err(Error::parameter("normalization", "paper", reason));
     }
-    options.check()
+    options.check_for((map.width(), map.height()))
 }
 
 /// The parallelogram whose covariance is that of a footprint's Gaussian: a box of width w has a variance of `w^2 / 12`.

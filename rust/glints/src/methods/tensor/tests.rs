@@ -385,3 +385,20 @@ fn the_error_against_uncompressed_images_is_the_ranks() {
     let (low, high) = (difference(2), difference(32));
     assert!(high < 0.01 && low > 5.0 * high, "{low} {high}");
 }
+
+#[test]
+fn more_images_than_can_be_numbered_are_refused() {
+    let options = Options {
+        stride: 4,
+        ..Options::default()
+    };
+    // A region of the second map would have more than 65535 images.
+    assert!(options.check_for((4096, 4096)).is_ok());
+    let error = options.check_for((8192, 8192)).unwrap_err().to_string();
+    assert!(error.contains("stride") && error.contains("larger"), "{error}");
+    for size in [(4096, 4096), (65_535, 500)] {
+        let geometry = pyramid::Geometry::new(size, 256, 4);
+        let members = images::Members::new(&geometry);
+        assert!(members.images.iter().all(|images| images.len() <= 1 << 16));
+    }
+}

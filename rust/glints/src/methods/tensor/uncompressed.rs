@@ -24,7 +24,7 @@ impl Uncompressed {
     /// # Errors
     /// As [`super::Tensor::new`].
     pub fn new(map: &NormalMap, model: FlakeModel, options: &Options) -> Result<Self> {
-        check(model, options)?;
+        check(map, model, options)?;
         let geometry = Geometry::new((map.width(), map.height()), options.resolution, options.stride);
         let lobes = Lobes::new(&model.flake, options.resolution);
         let pyramid = Pyramid::new(map, &geometry, lobes);
