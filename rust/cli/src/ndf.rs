@@ -165,7 +165,7 @@ enum MethodName {
     Yan16,
     /// The same with curved elements: the interpolated map
     Yan16Curved,
-    /// Tensor-decomposed distributions, rank 16 (Deng et al. 2022); takes minutes for a large map
+    /// Tensor-decomposed distributions, of the default rank (Deng et al. 2022); takes minutes for a large map
     Tensor,
     /// The one texel under the point
     Unfiltered,
