@@ -59,7 +59,6 @@ class OneTechnique:
 
     name: str
     """eval (samples of the light only) or sample (of the BSDF only)."""
-    environment_prefilter: bool = False
 
     def load(self):
         """The Mitsuba integrator."""

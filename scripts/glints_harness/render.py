@@ -126,11 +126,11 @@ class LoadedScene:
         return Rendering(image[..., :3], time.perf_counter() - wall, time.process_time() - processor)
 
     def integrator(self, lighting):
-        """The integrator of a `Lighting`, made once and ready: with prefiltered light it fits the scene's environment at
-        its first sample, which takes seconds and is no rendering."""
+        """The integrator of a `Lighting`, or of what loads one as it does, made once and ready: with prefiltered light it fits
+        the scene's environment at its first sample, which takes seconds and is no rendering."""
         if lighting not in self.integrators:
             made = self.integrators[lighting] = lighting.load()
-            if lighting.environment_prefilter:
+            if isinstance(lighting, Lighting) and lighting.environment_prefilter:
                 mi.render(self.scene, integrator=made, spp=1)
         return self.integrators[lighting]
 

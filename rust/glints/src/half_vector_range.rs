@@ -26,11 +26,12 @@
 //! h . e = N / sqrt(W),   N = e . (i + o(phi)),   W = |i + o(phi)|^2 = 2 + 2 i . o(phi),
 //! ```
 //!
-//! both first-order in `cos phi`, `sin phi`; the critical points are the at most four roots of `N' W - N W' / 2`,
-//! which are bracketed on a fixed grid of angles and refined by Newton's method.
+//! both first-order in `cos phi`, `sin phi`; the critical points are the at most four roots of `N' W - N W' / 2`, of second
+//! order. They are bracketed on a fixed grid of angles, two within one step by the extremum between them, and refined by
+//! Newton's method, kept inside the bracket: where W is almost zero, opposite `i` at the horizon, a small step of the angle
+//! changes `h` much.
 //!
-//! **Error** About 1e-6 of the rectangle's side. Two roots within one step of the grid may be missed; the
-//! values between them are flat to third order in that step, at most 1e-3 of the side.
+//! **Error** About 1e-6 of the rectangle's side.
 
 use std::f64::consts::TAU;
 
@@ -38,6 +39,9 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 
 /// Steps of the grid on which critical points are bracketed.
 const STEPS: usize = 24;
+
+/// Newton steps for a root, at most.
+const MOST_REFINEMENTS: usize = 40;
 
 /// The smallest rectangle `(low, high)`, in half vectors' x and y, that holds the half vectors of `wi` and all
 /// directions above the horizon within the angle with cosine `cos_angle` from `axis`; `None` if there are no such
@@ -166,23 +170,58 @@ impl Slope {
 
     /// Cosines and sines of the roots.
     fn roots(self) -> impl Iterator<Item = (f64, f64)> {
-        let angle = |step: usize| TAU * step as f64 / STEPS as f64;
-        (0..STEPS).filter_map(move |step| {
-            let (a, b) = (angle(step), angle(step + 1));
-            let [at_a, at_b] = [a, b].map(|phi| self.value(cos_sin(phi)));
-            if (at_a < 0.0) == (at_b < 0.0) {
-                return None;
+        let at = move |step: usize| {
+            let phi = TAU * step as f64 / STEPS as f64;
+            let p = cos_sin(phi);
+            (phi, self.value(p), self.derivative(p))
+        };
+        (0..STEPS)
+            .flat_map(move |step| self.brackets(at(step), at(step + 1)))
+            .flatten()
+            .map(move |(a, b)| self.root(a, b))
+    }
+
+    /// The intervals with one root each between two angles, given with value and derivative there.
+    fn brackets(&self, a: (f64, f64, f64), b: (f64, f64, f64)) -> [Option<(f64, f64)>; 2] {
+        let changes = |one: f64, other: f64| (one < 0.0) != (other < 0.0);
+        if changes(a.1, b.1) {
+            return [Some((a.0, b.0)), None];
+        }
+        // The value goes towards zero and comes back.
+        if a.1 * a.2 < 0.0 && b.1 * b.2 > 0.0 {
+            let middle = a.0 + (b.0 - a.0) * a.2 / (a.2 - b.2);
+            if changes(a.1, self.value(cos_sin(middle))) {
+                return [Some((a.0, middle)), Some((middle, b.0))];
             }
-            let mut phi = a + (b - a) * at_a / (at_a - at_b);
-            for _ in 0..3 {
-                let p = cos_sin(phi);
-                let step = self.value(p) / self.derivative(p);
-                if step.is_finite() {
-                    phi = (phi - step).clamp(a, b);
-                }
+        }
+        [None, None]
+    }
+
+    /// The root between two angles at which signs differ: Newton's method, or bisection where it leaves the bracket.
+    fn root(&self, mut a: f64, mut b: f64) -> (f64, f64) {
+        let is_negative = self.value(cos_sin(a)) < 0.0;
+        let mut phi = 0.5 * (a + b);
+        for _ in 0..MOST_REFINEMENTS {
+            let p = cos_sin(phi);
+            let value = self.value(p);
+            if (value < 0.0) == is_negative {
+                a = phi;
+            } else {
+                b = phi;
             }
-            Some(cos_sin(phi))
-        })
+            let newton = phi - value / self.derivative(p);
+            let next = if a < newton && newton < b {
+                newton
+            } else {
+                0.5 * (a + b)
+            };
+            let step = (next - phi).abs();
+            phi = next;
+            if step < 1e-9 {
+                break;
+            }
+        }
+        cos_sin(phi)
     }
 }
 
@@ -260,6 +299,23 @@ mod tests {
                 prop_assert!(bounds.0.cmple(low + gap).all() && bounds.1.cmpge(high - gap).all(),
                     "{bounds:?} leaves gaps to {low}, {high}");
             }
+        }
+    }
+
+    /// Light from below the horizon, opposite a grazing viewer: W is almost zero, and two critical points are close.
+    #[test]
+    fn light_opposite_a_grazing_viewer_is_held() {
+        let (wi, axis) = (
+            direction(0.05, 1.150_936_8),
+            direction(-0.396_682_68, 3.600_449_6),
+        );
+        let cos = 0.712_961_26_f32.cos();
+        let (low, high) = half_vector_rectangle(wi, axis, cos).unwrap();
+        for h in half_vectors(wi, axis, cos) {
+            assert!(
+                h.cmpge(low - 1e-4).all() && h.cmple(high + 1e-4).all(),
+                "{h} is not in {low} to {high}"
+            );
         }
     }
 
