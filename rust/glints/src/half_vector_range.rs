@@ -170,13 +170,13 @@ impl Slope {
 
     /// Cosines and sines of the roots.
     fn roots(self) -> impl Iterator<Item = (f64, f64)> {
-        let at = move |step: usize| {
+        let nodes: [_; STEPS + 1] = std::array::from_fn(|step| {
             let phi = TAU * step as f64 / STEPS as f64;
             let p = cos_sin(phi);
             (phi, self.value(p), self.derivative(p))
-        };
+        });
         (0..STEPS)
-            .flat_map(move |step| self.brackets(at(step), at(step + 1)))
+            .flat_map(move |step| self.brackets(nodes[step], nodes[step + 1]))
             .flatten()
             .map(move |(a, b)| self.root(a, b))
     }

@@ -489,6 +489,14 @@ mod tests {
     use crate::methods::compact::lanes::LANES;
     use proptest::prelude::*;
 
+    /// Edges of a parallelogram: a length, the other's ratio to it, and where each turns.
+    fn edges(length: f64, ratio: f64, angles: (f64, f64)) -> [DVec2; 2] {
+        [
+            DVec2::from_angle(angles.0) * length,
+            DVec2::from_angle(angles.0 + angles.1) * length * ratio,
+        ]
+    }
+
     proptest! {
         #[test]
         fn weights_are_areas(
@@ -498,8 +506,7 @@ mod tests {
             angles in (0.0..6.3_f64, 0.3..2.8_f64),
             first in (0..30_u32, 0..30_u32),
         ) {
-            let a = DVec2::from_angle(angles.0) * length;
-            let b = DVec2::from_angle(angles.0 + angles.1) * length * ratio;
+            let [a, b] = edges(length, ratio, angles);
             let footprint = Footprint::in_texels(40, 40, center.into(), a, b);
             let region = footprint.region().unwrap();
             let window = FootprintFilter::Box.over(&footprint).single_window().unwrap();
@@ -525,8 +532,7 @@ mod tests {
             angles in (0.0..6.3_f64, 0.3..2.8_f64),
             deviation in 0.1..1.0_f32,
         ) {
-            let a = DVec2::from_angle(angles.0) * length;
-            let b = DVec2::from_angle(angles.0 + angles.1) * length * ratio;
+            let [a, b] = edges(length, ratio, angles);
             let footprint = Footprint::in_texels(96, 96, center.into(), a, b);
             let filtered = FootprintFilter::gaussian(deviation).unwrap().over(&footprint);
             let (mut distance, mut missed) = (0.0, 0.0);

@@ -203,14 +203,15 @@ impl CompactBinMap {
         let finest = finest_counted_level(&tree, &bins, least_level, taken, share);
         let grid = texels.grid();
         let quantised = |column, row| grid.normal(grid.cell(map.normal(column, row)));
-        let is_counted = |normal: &Vec3| core.strays == 0.0 || Counts::holds(&bins, *normal);
+        let has_strays = core.strays > 0.0 && finest < tree.levels();
+        let is_counted = |normal: &Vec3| !has_strays || Counts::holds(&bins, *normal);
         let counts = Counts::new(&tree, bins, alpha, finest, |column, row| {
             Some(quantised(column, row)).filter(is_counted)
         });
-        let strays = if core.strays == 0.0 || finest >= tree.levels() {
-            Strays::none()
-        } else {
+        let strays = if has_strays {
             Strays::of(map, grid, lobe.reach(), |normal| !is_counted(normal))
+        } else {
+            Strays::none()
         };
         Self::assemble(size, model, tree, texels, counts, strays)
     }
