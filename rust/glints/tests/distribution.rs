@@ -213,8 +213,7 @@ fn binned_distribution_is_near_the_direct_one() {
 
 #[test]
 fn compact_distribution_is_the_direct_one() {
-    // Sorted blocks at 0.02, texels in the map's order at 0.05 and 0.16; from 64 texels on with counts; the widest footprints
-    // meet the same blocks in several periods of the map.
+    // From 64 texels on with counts; the widest footprints meet the same nodes in several periods of the map.
     let map = gaussian_map(64, [0.4, 0.3], 2);
     for alpha in [0.02, 0.05, 0.16] {
         let model = model(alpha, Normalization::Projected);

@@ -126,7 +126,7 @@ fn attempt(path: &Path, random: &mut Random) -> Attempt {
     }
 }
 
-/// Saved structures of several shapes: both ways of storing texels, with and without counts, with incomplete blocks, of
+/// Saved structures of several shapes: texels of several widths, with and without counts, with incomplete tiles, of
 /// interpolated maps, with texels that are in no bin.
 fn valid_files(folder: &Path) -> Vec<Vec<u8>> {
     /// Most slopes are small, and a few are large.

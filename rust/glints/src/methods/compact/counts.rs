@@ -16,15 +16,18 @@
 //! **Layout** One array a level, nodes row by row, bins of a node row by row, of the narrowest whole numbers that hold the
 //! level's largest count.
 
+use std::sync::atomic::AtomicU32;
+use std::sync::atomic::Ordering::Relaxed;
+
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use wide::{CmpLe, f32x8};
 
 use super::cover::{Node, Tree};
 use super::grid::Grid;
-use super::lanes::LANES;
+use super::lanes::{LANES, to_float, widened};
 use super::lobes::{Lobe, Normals, Sums};
-use super::packing::{prefetch, to_float, widened};
+use super::memory::prefetch;
 use crate::array::Array;
 
 /// Width of a bin in standard deviations of a lobe, `alpha / sqrt 2`; the paper has 1.2 (Eq. 16 of Atanasov et al. 2021).
@@ -47,6 +50,9 @@ const LEAST_SHARE: f32 = 0.2;
 /// Width in bins of the margin around what is counted: one for the noise, and a little because bounds are those of normals
 /// before they are quantised.
 const MARGIN: f64 = 1.25;
+
+/// A level of fewer nodes is counted by all threads, node by node.
+const FEW_NODES: usize = 16;
 
 /// Numbers after the end of a level that a query may read and ignore.
 pub const PADDING: usize = 32;
@@ -150,12 +156,22 @@ impl Counts {
         let stride = counts.stride();
         let base = level(tree, finest, stride, |node, histogram| {
             let rect = tree.rect(node);
-            for row in rect.low.1..rect.high.1 {
+            let count_row = |row: u32, increment: &dyn Fn(&AtomicU32)| {
                 for column in rect.low.0..rect.high.0 {
                     if let Some(normal) = normal(column, row) {
-                        histogram[counts.bin(normal, (column, row))] += 1;
+                        increment(&histogram[counts.bin(normal, (column, row))]);
                     }
                 }
+            };
+            let rows = rect.low.1..rect.high.1;
+            if tree.nodes(finest) < FEW_NODES {
+                rows.into_par_iter().for_each(|row| {
+                    count_row(row, &|count| {
+                        count.fetch_add(1, Relaxed);
+                    })
+                });
+            } else {
+                rows.for_each(|row| count_row(row, &|count| add(count, 1)));
             }
         });
         counts.levels.push(Some(base));
@@ -164,8 +180,8 @@ impl Counts {
             let coarser = level(tree, index, stride, |node, histogram| {
                 for child in tree.children(node) {
                     let start = tree.index(&child) * stride;
-                    for (bin, sum) in histogram.iter_mut().enumerate() {
-                        *sum += finer.get(start + bin);
+                    for (bin, sum) in histogram.iter().enumerate() {
+                        add(sum, finer.get(start + bin));
                     }
                 }
             });
@@ -483,47 +499,49 @@ impl<'a> CountSum<'a> {
     }
 }
 
+/// Adds to a number that no other thread adds to.
+#[inline(always)]
+fn add(sum: &AtomicU32, number: u32) {
+    sum.store(sum.load(Relaxed) + number, Relaxed);
+}
+
 /// Fills one level: `count` adds up a node's histogram.
-fn level(tree: &Tree, index: usize, stride: usize, count: impl Fn(&Node, &mut [u32]) + Sync) -> Level {
+fn level(tree: &Tree, index: usize, stride: usize, count: impl Fn(&Node, &[AtomicU32]) + Sync) -> Level {
     let nodes = tree.nodes(index);
-    let histogram = |histogram: &mut Vec<u32>, k: usize| {
-        histogram.clear();
-        histogram.resize(stride, 0);
-        count(&tree.node(index, k), histogram);
+    let histogram = |scratch: &mut Vec<AtomicU32>, k: usize| {
+        scratch.clear();
+        scratch.resize_with(stride, AtomicU32::default);
+        count(&tree.node(index, k), scratch);
     };
-    let largest = (0..nodes)
-        .into_par_iter()
-        .map_init(Vec::new, |scratch, k| {
-            histogram(scratch, k);
-            scratch.iter().copied().max().unwrap_or(0)
-        })
-        .max()
-        .unwrap_or(0);
-    fn fill<T: Copy + Default + Send>(
-        nodes: usize,
-        stride: usize,
-        histogram: impl Fn(&mut Vec<u32>, usize) + Sync,
-        narrow: impl Fn(u32) -> T + Sync,
-    ) -> Vec<T> {
-        let mut counts = vec![T::default(); nodes * stride + PADDING];
-        counts[..nodes * stride]
-            .par_chunks_mut(stride)
-            .enumerate()
-            .for_each_init(Vec::new, |scratch, (k, counts)| {
-                histogram(scratch, k);
-                for (narrowed, &count) in counts.iter_mut().zip(scratch.iter()) {
-                    *narrowed = narrow(count);
-                }
-            });
-        counts
-    }
-    if largest <= u8::MAX.into() {
-        Level::U8(fill(nodes, stride, histogram, |c| c as u8).into())
-    } else if largest <= u16::MAX.into() {
-        Level::U16(fill(nodes, stride, histogram, |c| c as u16).into())
+    // The narrowest numbers fit as a rule: they are tried first, rather than counting twice.
+    if let Some(counts) = fill(nodes, stride, &histogram) {
+        Level::U8(counts.into())
+    } else if let Some(counts) = fill(nodes, stride, &histogram) {
+        Level::U16(counts.into())
     } else {
-        Level::U32(fill(nodes, stride, histogram, |c| c).into())
+        let counts = fill(nodes, stride, &histogram);
+        Level::U32(counts.expect("a node has less than 2^32 texels").into())
     }
+}
+
+/// The histograms of all nodes, if their numbers are wide enough.
+fn fill<T: Copy + Default + Send + TryFrom<u32>>(
+    nodes: usize,
+    stride: usize,
+    histogram: &(impl Fn(&mut Vec<AtomicU32>, usize) + Sync),
+) -> Option<Vec<T>> {
+    let mut counts = vec![T::default(); nodes * stride + PADDING];
+    counts[..nodes * stride]
+        .par_chunks_mut(stride)
+        .enumerate()
+        .try_for_each_init(Vec::new, |scratch, (k, counts)| {
+            histogram(scratch, k);
+            for (narrowed, count) in counts.iter_mut().zip(scratch.iter()) {
+                *narrowed = T::try_from(count.load(Relaxed)).ok()?;
+            }
+            Some(())
+        })?;
+    Some(counts)
 }
 
 /// Bits of a texel that look random: the finaliser of MurmurHash3.

@@ -1,6 +1,6 @@
 //! Saving and loading: a structure is built once, and used in place by every later run.
 //!
-//! **Format**, version 4. A file is a [`container`](crate::container) with these fields, f32 and f64 as their bits, f64 with the
+//! **Format**, version 5. A file is a [`container`](crate::container) with these fields, f32 and f64 as their bits, f64 with the
 //! lower half first:
 //!
 //! | field | type | |
@@ -9,27 +9,22 @@
 //! | 2 | f32 | roughness of a flake, as [`Flake`] takes it |
 //! | 3 | u32 | its distribution: 0 Beckmann, 1 GGX |
 //! | 4 | u32 | normalization: 0 projected area, 1 as in the paper |
-//! | 5 | u32 | texels: 0 in [`super::tiles`], 1 in [`super::blocks`] |
-//! | 6 | 2 u32 | of blocks, s and r; of tiles, zero |
-//! | 8 | 3 f32, 2 u32 | grid of the quantised normals: corner, pitch, columns and rows |
-//! | 13 | 3 f32, 2 u32 | bins of the counts, likewise |
-//! | 18 | u32 | finest level with counts; the number of levels if none has |
-//! | 19 | u32 | interpolation of the map that it was made from: 0 none, 1 bilinear |
-//! | 20 | u32 | texels for each texel and side of that map, 1 to 8; without interpolation 1 |
-//! | 21 | f32 | step between their normals, see [`Refinement::step`]; without interpolation 0 |
-//! | 22 | 3 f64 | covariance of that map's slopes: uu, uv, vv |
-//! | 28 | u32 | [`NormalMap::checksum`] of that map |
-//! | 29 | 3 u32 | of [`super::strays`]: width of a square, columns and rows of squares |
+//! | 5 | 3 f32, 2 u32 | grid of the quantised normals: corner, pitch, columns and rows |
+//! | 10 | 3 f32, 2 u32 | bins of the counts, likewise |
+//! | 15 | u32 | finest level with counts; the number of levels if none has |
+//! | 16 | u32 | interpolation of the map that it was made from: 0 none, 1 bilinear |
+//! | 17 | u32 | texels for each texel and side of that map, 1 to 8; without interpolation 1 |
+//! | 18 | f32 | step between their normals, see [`Refinement::step`]; without interpolation 0 |
+//! | 19 | 3 f64 | covariance of that map's slopes: uu, uv, vv |
+//! | 25 | u32 | [`NormalMap::checksum`] of that map |
+//! | 26 | 3 u32 | of [`super::strays`]: width of a square, columns and rows of squares |
 //!
 //! and sections, in this order:
 //!
 //! | elements | |
 //! |---|---|
-//! | u32 | packed words of blocks, or tiles |
-//! | 3 u32 | blocks: extents of the rows of cells |
-//! | u32 | blocks: where the rows of cells begin |
-//! | u16 or u32 | blocks: where the cells begin |
-//! | u16 | blocks: pointers of the permutations, each the number of another |
+//! | u8 | [`super::tiles`]: upper bytes |
+//! | u32 | tiles: lower bits |
 //! | u8, u16 or u32 | for each level that has them, from the finest on: counts, with their padding |
 //! | u32 | strays: where the squares begin |
 //! | 3 u32 | strays |
@@ -37,7 +32,7 @@
 //! Whatever changes these arrays, or a constant that queries of them rely on, takes another version. Versions up to 3 had
 //! a head of their own, with the number of the version at the same place, so that they are told apart and refused.
 //!
-//! **The map** Fields 19 to 28 are what a renderer needs of the map when it has only the file: the slopes for shadowing, the map's
+//! **The map** Fields 16 to 25 are what a renderer needs of the map when it has only the file: the slopes for shadowing, the map's
 //! own, not those of quantised or refined normals; and by what the map is known again.
 //!
 //! **Loading** maps the file into memory, and reads all of it once, at about 8 GB/s once it is in the page cache (65 MB of a
@@ -51,14 +46,13 @@ use std::path::Path;
 
 use glam::Vec2;
 
-use super::blocks::{Blocks, Geometry, Offsets, Parts};
 use super::check::{self, demand};
 use super::counts::{self, Counts, Level};
 use super::cover::Tree;
 use super::grid::Grid;
 use super::strays::Strays;
 use super::tiles::Tiles;
-use super::{CompactBinMap, LEAF_BITS, Texels};
+use super::{CompactBinMap, LEAF_BITS};
 use crate::container::{Checked, Contents, Head, Kind, Section};
 use crate::error::{Error, Result};
 use crate::flakes::{FlakeModel, Normalization};
@@ -67,7 +61,7 @@ use crate::normal_map::{MIN_Z, NormalMap, SlopeCovariance};
 use crate::refinement::{MAX_REFINEMENT, Refinement};
 
 /// The version that is written, and the only one that is read.
-pub const VERSION: u32 = 4;
+pub const VERSION: u32 = 5;
 
 const KIND: Kind = Kind {
     magic: *b"\x89GLINTS\n",
@@ -241,19 +235,8 @@ impl CompactBinMap {
     }
 
     fn sections(&self) -> Vec<Section<'_>> {
-        let mut sections = match &self.texels {
-            Texels::Tiles(tiles) => vec![Section::new(tiles.units())],
-            Texels::Blocks(blocks) => vec![
-                Section::new(blocks.words.units()),
-                Section::new(&blocks.extents),
-                Section::new(&blocks.rows),
-                match &blocks.offsets {
-                    Offsets::Narrow(offsets) => Section::new(offsets),
-                    Offsets::Wide(offsets) => Section::new(offsets),
-                },
-                Section::new(&blocks.pointers),
-            ],
-        };
+        let (upper, lower) = self.texels.parts();
+        let mut sections = vec![Section::new(upper), Section::new(lower)];
         let levels = self.counts.levels().iter().flatten();
         sections.extend(levels.map(|level| match level {
             Level::U8(counts) => Section::new(counts),
@@ -266,13 +249,6 @@ impl CompactBinMap {
     }
 
     fn fields(&self, origin: &Origin) -> Vec<u32> {
-        let (layout, side_bits, cell_bits, grid) = match &self.texels {
-            Texels::Tiles(tiles) => (0, 0, 0, tiles.grid()),
-            Texels::Blocks(blocks) => {
-                let geometry = blocks.geometry();
-                (1, geometry.side_bits, geometry.cell_bits, &geometry.grid)
-            }
-        };
         let distribution = match self.model.flake.kind() {
             Distribution::Beckmann => 0,
             Distribution::Ggx => 1,
@@ -295,8 +271,8 @@ impl CompactBinMap {
         let halves = |value: f64| [value.to_bits() as u32, (value.to_bits() >> 32) as u32];
 
         let mut fields = vec![self.map.0, self.map.1, self.model.flake.alpha().to_bits()];
-        fields.extend([distribution, normalization, layout, side_bits, cell_bits]);
-        fields.extend(grid_fields(grid));
+        fields.extend([distribution, normalization]);
+        fields.extend(grid_fields(self.texels.grid()));
         fields.extend(grid_fields(self.counts.bins()));
         fields.extend([finest as u32, interpolation, refinement, step.to_bits()]);
         fields.extend([xx, xy, yy].into_iter().flat_map(halves));
@@ -310,7 +286,7 @@ impl CompactBinMap {
 struct Fields {
     map: (u32, u32),
     model: FlakeModel,
-    layout: Layout,
+    grid: Grid,
     bins: Grid,
     tree: Tree,
     finest: usize,
@@ -319,29 +295,12 @@ struct Fields {
     squares: [u32; 3],
 }
 
-/// How texels are stored.
-enum Layout {
-    Tiles(Grid),
-    Blocks(Geometry),
-}
-
-impl Layout {
-    /// Number of sections.
-    fn sections(&self) -> usize {
-        match self {
-            Self::Tiles(_) => 1,
-            Self::Blocks(_) => 5,
-        }
-    }
-}
-
 impl Fields {
     fn new(head: &Head) -> Checked<Self> {
         let mut words = Words(&head.fields);
         let [width, height] = words.take()?;
         let map = (width, height);
         let [alpha, distribution, normalization] = words.take()?;
-        let [layout, side_bits, cell_bits] = words.take()?;
         let (grid, bins) = (words.grid()?, words.grid()?);
         let [finest] = words.take()?;
         let origin = words.origin(map)?;
@@ -360,25 +319,9 @@ impl Fields {
             other => return Err(format!("normalization {other}")),
         };
         let flake = Flake::new(distribution, f32::from_bits(alpha)).map_err(|e| e.to_string())?;
-        let (layout, leaf_bits) = match layout {
-            0 => {
-                check::tile_grid(&grid)?;
-                (Layout::Tiles(grid), LEAF_BITS)
-            }
-            1 => {
-                let geometry = Geometry {
-                    map,
-                    side_bits,
-                    cell_bits,
-                    grid,
-                };
-                check::geometry(&geometry)?;
-                (Layout::Blocks(geometry), side_bits)
-            }
-            other => return Err(format!("layout {other}")),
-        };
+        check::tile_grid(&grid)?;
         check::bins(&bins, flake.alpha())?;
-        let tree = Tree::new(map, leaf_bits);
+        let tree = Tree::new(map, LEAF_BITS);
         let finest = finest as usize;
         demand(finest <= tree.levels(), || {
             "counts of a level that does not exist".into()
@@ -386,7 +329,7 @@ impl Fields {
         let fields = Self {
             map,
             model: FlakeModel { flake, normalization },
-            layout,
+            grid,
             bins,
             tree,
             finest,
@@ -401,7 +344,7 @@ impl Fields {
     }
 
     fn texel_sections(&self) -> Range<usize> {
-        0..self.layout.sections()
+        0..2
     }
 
     fn count_sections(&self) -> Range<usize> {
@@ -429,10 +372,7 @@ impl Fields {
     }
 
     fn structure(self, contents: &mut Contents) -> Checked<CompactBinMap> {
-        let texels = match &self.layout {
-            Layout::Tiles(grid) => Texels::Tiles(self.tiles(grid, contents)?),
-            Layout::Blocks(geometry) => Texels::Blocks(blocks(geometry, contents)?),
-        };
+        let texels = self.tiles(contents)?;
         let counts = self.counts(contents)?;
         let strays = Strays {
             squares: self.squares,
@@ -445,10 +385,14 @@ impl Fields {
         ))
     }
 
-    fn tiles(&self, grid: &Grid, contents: &mut Contents) -> Checked<Tiles> {
-        let (_, units) = Tiles::layout(grid, self.map);
-        let units = contents.take_exactly(units as u64)?;
-        Ok(Tiles::from_units(self.map, *grid, units))
+    fn tiles(&self, contents: &mut Contents) -> Checked<Tiles> {
+        let tiles = Tiles::from_parts(self.map, self.grid, Default::default());
+        let (upper, lower) = tiles.lengths();
+        let (upper, lower) = (
+            contents.take_exactly(upper as u64)?,
+            contents.take_exactly(lower as u64)?,
+        );
+        Ok(Tiles::from_parts(self.map, self.grid, (upper, lower)))
     }
 
     fn counts(&self, contents: &mut Contents) -> Checked<Counts> {
@@ -469,30 +413,6 @@ impl Fields {
         }
         Ok(Counts::from_levels(self.bins, self.model.flake.alpha(), levels))
     }
-}
-
-fn blocks(geometry: &Geometry, contents: &mut Contents) -> Checked<Blocks> {
-    let blocks = geometry.block_count() as u64;
-    let words = contents.take_exactly(geometry.units() as u64)?;
-    let extents = contents.take_exactly(geometry.cell_rows() as u64)?;
-    let cells = check::extents(geometry, &extents)? as u64;
-    let rows = contents.take_exactly(blocks * (geometry.cell_rows() as u64 + 1))?;
-    let offsets = match contents.next_width() {
-        Some(2) => Offsets::Narrow(contents.take_exactly(blocks * cells)?),
-        _ => Offsets::Wide(contents.take_exactly(blocks * cells)?),
-    };
-    let pointers = contents.take_exactly(blocks * geometry.pointers() as u64)?;
-    let parts = Parts {
-        words,
-        starts: geometry.starts().into(),
-        extents,
-        rows,
-        offsets,
-        pointers,
-    };
-    let blocks = Blocks::from_parts(*geometry, parts);
-    check::blocks(&blocks)?;
-    Ok(blocks)
 }
 
 /// Fields that are still to be read.

@@ -88,11 +88,25 @@ pub fn bits(mut mask: u32) -> impl Iterator<Item = usize> {
     })
 }
 
-/// Bit k: `first + k` is in the half-open interval.
+/// Eight narrower numbers. Spelled out: as a loop, it goes through memory.
 #[inline(always)]
-pub fn lane_mask((start, end): (i64, i64), first: i64) -> u32 {
-    let below = |bound: i64| (1_u32 << (bound - first).clamp(0, 8)) - 1;
-    below(end) & !below(start)
+pub fn widened<T: Copy + Into<u32>>(&[a, b, c, d, e, f, g, h]: &[T; 8]) -> u32x8 {
+    u32x8::new([
+        a.into(),
+        b.into(),
+        c.into(),
+        d.into(),
+        e.into(),
+        f.into(),
+        g.into(),
+        h.into(),
+    ])
+}
+
+/// Whole numbers below 2^31 as floating-point ones.
+#[inline(always)]
+pub fn to_float(words: u32x8) -> f32x8 {
+    f32x8::from_i32x8(bytemuck::cast(words))
 }
 
 #[cfg(test)]

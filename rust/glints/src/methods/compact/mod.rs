@@ -18,39 +18,34 @@
 //!
 //! * a texel's normal, at a twentieth of a standard deviation, takes as many bits as both maps together need for its bin
 //!   alone: what is exact costs no more memory, if it is stored once;
-//! * a byte of each coordinate tells for 64 texels at a time which are near the half vector: testing a thousand is cheaper
-//!   than walking a tree. Only what need not be looked at must be left out.
+//! * a byte of each coordinate tells for 64 texels at a time which are near the half vector ([`tiles`]): testing a thousand is
+//!   cheaper than walking a tree.
 //!
-//! What can be left out depends on the roughness. Of a footprint's texels, a share of about `3 alpha^2` (times the map's
-//! concentration) matters:
+//! So the texels of a footprint are simply tested, all of them, in the map's order. Footprints that hold many texels that matter are large
+//! against them, and their distribution is a mean over many: above a size, [`counts`] answer for whole squares of texels, and squares at
+//! the border that are small against the footprint are weighted by their area ([`cover`]). Texels that the border cuts get their
+//! exact area ([`border`]). Counts are for the core of a map's directions; the few texels in long tails are listed and added
+//! one by one ([`strays`]).
 //!
-//! | roughness | share | texels are kept | module |
-//! |---|---|---|---|
-//! | low | under [`ROUGH`] | sorted by direction, in blocks: only the cells around h are read | [`blocks`] |
-//! | high | more | in the map's order: all texels of the footprint are tested | [`tiles`] |
+//! **Memory** 2.5 to 4 bytes a texel for the normals, two bytes at most for the rest: counts are kept of as many levels, from the
+//! whole map down, as fit into [`BYTES_PER_TEXEL`].
 //!
-//! Footprints that hold many texels that matter are large against them, and their distribution is a mean over many: above
-//! a size, [`counts`] answer for whole squares of texels, and squares at the border that are small against the footprint
-//! are weighted by their area ([`cover`]). Texels that the border cuts get their exact area ([`border`]). Counts are for the core
-//! of a map's directions; the few texels in long tails are listed and added one by one ([`strays`]).
-//!
-//! **Memory** 2.5 to 4 bytes a texel for the normals, a byte and a half at most for the rest: counts are kept of as many
-//! levels, from the whole map down, as fit into [`BYTES_PER_TEXEL`].
-//!
-//! **Exactness** Quantisation is at most about a twentieth of a lobe's standard deviation (for alpha >= 0.003; below, where
-//! 32 bits do not suffice, a step grows to 1e-4), which is up to 1.9 % of relative L1 error for a single lobe, less for
+//! **Exactness** Quantisation is at most about a twentieth of a lobe's standard deviation (for alpha >= 0.002; below, where
+//! 32 bits do not suffice, a step grows to 3e-5 of the map's range), which is up to 2 % of relative L1 error for a single lobe, less for
 //! several. Counts and blurred borders cost up to 2.3 % for footprints of more than a hundred texels' width on the maps of the
 //! scenes. Sampling, density and evaluation are exact partners: lobes are truncated for all three, and
 //! `sample` treats a texel as the cover of the footprint does.
 //!
-//! **Bounds** A footprint of one texel takes about a microsecond, and one that covers the map evenly less, where there are
-//! counts. (The published structure takes a third of that for a few texels at low roughness: it stores where a texel is, while a block
-//! is read around the half vector, and a texel of it is found by following up to [`blocks::STRIDE`] of its permutation.) In between, evaluation grows with the number of texels within reach, by some nanoseconds each, until the border
-//! may be blurred: that bounds low roughness by the texels of a few blocks, and high roughness by those of the cut squares.
-//! Most expensive are footprints of hundreds of texels' width, or long and thin ones, at high roughness: thousands of lobes
-//! matter, of which any subset would be off by more than 2 %, and squares with counts are not small against the footprint. So it
-//! is where most of a map's normals are alike, but a few on edge, and roughness is low: normals take 32 bits over all directions, which
-//! leaves no memory for counts of squares of less than 512 texels a side.
+//! **Bounds** A footprint of up to 16 x 16 texels takes half a microsecond to one, at low roughness, `sample` the same, and so does one that
+//! covers the map evenly, where there are counts. In between, evaluation grows with the number of texels, by 0.15 ns each, and with that of
+//! texels within reach, by some nanoseconds each, until the border may be blurred. Most expensive are
+//!
+//! * footprints of hundreds of texels' width, or long and thin ones, at high roughness: thousands of lobes matter, of which any subset
+//!   would be off by more than 2 %, and squares with counts are not small against the footprint;
+//! * footprints of 256 to 1024 texels' width at low roughness, 10 to 200 microseconds, although few lobes matter, because all
+//!   texels are tested. (A former version sorted the texels by direction, in blocks, and read the few cells around the half vector: 2 to
+//!   20 microseconds there. To find the one at a given place then took 4 microseconds, a chain of cache misses along the
+//!   inverse of the sort, for every sample of every footprint. Both orders together take the memory of the published structure.)
 //!
 //! **Gaussian footprints** ([`CompactBinMap::with_filter`], [`crate::footprint_filter`]) go the same ways. No two texels weigh
 //! the same, so that single texels are weighted one by one where they are near the half vector, eight at a time ([`border`]),
@@ -60,8 +55,8 @@
 //! much more.
 //!
 //! **One roughness a structure** Spatially varying roughness is not offered: each structure answers for the roughness that it
-//! was built with. Tiles and blocks could answer for any roughness a that is at least the built one, alpha: their normals are
-//! fine enough, and blocks would read about `(a / alpha)^2` times as many texels. Counts bind. Their bins are half a lobe wide,
+//! was built with. Tiles could answer for any roughness a that is at least the built one, alpha: their normals are
+//! fine enough. Counts bind. Their bins are half a lobe wide,
 //! and a lobe twice as wide reaches hundreds of them, to be summed for every node; beyond that a query would cost more than the
 //! texels. The answer is a structure for each roughness, 13 to 18 MB for 2048 x 2048 texels, 67 MB for four of them, and a
 //! blend of materials that picks one.
@@ -69,7 +64,6 @@
 //! **Files** A structure is saved with [`CompactBinMap::save`] and used in place after [`CompactBinMap::load`]; the format
 //! stands at the top of the module `file`.
 
-mod blocks;
 mod border;
 mod check;
 mod counts;
@@ -78,7 +72,7 @@ mod file;
 mod grid;
 mod lanes;
 mod lobes;
-mod packing;
+mod memory;
 mod strays;
 mod tiles;
 
@@ -93,24 +87,15 @@ use crate::footprint_filter::{FilteredFootprint, FilteredPart, FootprintFilter, 
 use crate::half_vector::DirectionPair;
 use crate::hash::mix;
 use crate::normal_map::NormalMap;
-use blocks::{Blocks, Geometry, Reader};
 use border::{Border, Weight};
 use counts::{CountSum, Counts};
 use cover::{Node, Rect, Scale, Treatment, Tree};
 use grid::Grid;
 use lobes::{Lobe, Query, Sums};
-use packing::WIDTHS;
 use strays::Strays;
 use tiles::Tiles;
 
 pub use file::{Header, Origin, VERSION, is_saved, read_header};
-
-/// Share of a map's texels within reach of a typical half vector from which they are kept in the map's order.
-pub const ROUGH: f64 = 0.02;
-
-/// Most texels of a block within reach of a typical half vector: a small footprint reads them all, and a large one pays for
-/// each block that it meets.
-const NEAR_TEXELS: f64 = 128.0;
 
 /// What the whole structure may take, 18 MB for 2048 x 2048 texels.
 pub const BYTES_PER_TEXEL: f64 = 18e6 / (2048.0 * 2048.0);
@@ -118,13 +103,10 @@ pub const BYTES_PER_TEXEL: f64 = 18e6 / (2048.0 * 2048.0);
 /// Quantisation of normals in standard deviations of a lobe.
 const QUANTUM: f64 = 0.055;
 
-/// Least number of texels of a block for each cell of the directory: fewer make the cells smaller, and the directory larger.
-const TEXELS_PER_CELL: f64 = 6.0;
-
-/// A footprint that touches fewer texels is summed over them where they are kept in the map's order.
+/// A footprint that touches fewer texels is summed over them.
 const DIRECT: f64 = 6500.0;
 
-/// Side of the smallest square of texels with counts, as a power of two, where texels are kept in the map's order.
+/// Side of the smallest square of texels with counts, as a power of two.
 const LEAF_BITS: u32 = 4;
 
 /// See the module.
@@ -134,7 +116,7 @@ pub struct CompactBinMap {
     filter: FootprintFilter,
     lobe: Lobe,
     tree: Tree,
-    texels: Texels,
+    texels: Tiles,
     counts: Counts,
     /// Texels that are in no bin.
     strays: Strays,
@@ -142,39 +124,6 @@ pub struct CompactBinMap {
     finest: usize,
     /// Relative deviation of the parts of each level's nodes.
     deviations: Vec<f64>,
-}
-
-/// The quantised normals.
-enum Texels {
-    Tiles(Tiles),
-    Blocks(Blocks),
-}
-
-impl Texels {
-    fn cell(&self, (column, row): (u32, u32)) -> [u32; 2] {
-        match self {
-            Self::Tiles(tiles) => tiles.cell(column, row),
-            Self::Blocks(blocks) => blocks.cell(column, row),
-        }
-    }
-
-    fn normal(&self, texel: (u32, u32)) -> Vec3 {
-        self.grid().normal(self.cell(texel))
-    }
-
-    fn bytes(&self) -> usize {
-        match self {
-            Self::Tiles(tiles) => tiles.units().bytes(),
-            Self::Blocks(blocks) => blocks.bytes(),
-        }
-    }
-
-    fn grid(&self) -> &Grid {
-        match self {
-            Self::Tiles(tiles) => tiles.grid(),
-            Self::Blocks(blocks) => &blocks.geometry().grid,
-        }
-    }
 }
 
 impl CompactBinMap {
@@ -185,22 +134,13 @@ impl CompactBinMap {
         let bounds = grid::bounds(map, Vec3::truncate);
         let lobe = Lobe::new(model.flake.kind(), f64::from(alpha).powi(2));
         let share = share_in_reach(map, bounds, &lobe);
-        let (texels, leaf_bits) = if share >= ROUGH {
-            let grid = tiles::grid(bounds, QUANTUM * deviation(alpha));
-            (Texels::Tiles(Tiles::new(map, grid)), LEAF_BITS)
-        } else {
-            let geometry = block_geometry(size, alpha, share, bounds);
-            (Texels::Blocks(Blocks::new(map, geometry)), geometry.side_bits)
-        };
-        let tree = Tree::new(size, leaf_bits);
+        let texels = Tiles::new(map, tiles::grid(bounds, QUANTUM * deviation(alpha)));
+        let tree = Tree::new(size, LEAF_BITS);
         let core = strays::core(map, lobe.reach());
         let bins = counts::bins(counts::bin_width(alpha, share), core.bounds);
-        let least_level = match texels {
-            Texels::Tiles(_) => 0,
-            Texels::Blocks(_) => 1,
-        };
-        let taken = texels.bytes() as f64 + core.strays * Strays::BYTES * map.normals().len() as f64;
-        let finest = finest_counted_level(&tree, &bins, least_level, taken, share);
+        let count = map.normals().len() as f64;
+        let left = BYTES_PER_TEXEL * count - texels.bytes() as f64 - core.strays * Strays::BYTES * count;
+        let finest = finest_counted_level(&tree, &bins, left, share);
         let grid = texels.grid();
         let quantised = |column, row| grid.normal(grid.cell(map.normal(column, row)));
         let has_strays = core.strays > 0.0 && finest < tree.levels();
@@ -220,7 +160,7 @@ impl CompactBinMap {
         map: (u32, u32),
         model: FlakeModel,
         tree: Tree,
-        texels: Texels,
+        texels: Tiles,
         counts: Counts,
         strays: Strays,
     ) -> Self {
@@ -294,15 +234,14 @@ impl CompactBinMap {
 
     /// Whether the nodes of a level of the tree can be taken as a whole.
     fn is_unit(&self) -> impl Fn(usize) -> bool + '_ {
-        let blocks = matches!(self.texels, Texels::Blocks(_));
-        move |level| self.counts.has(level) || (blocks && level == 0)
+        |level| self.counts.has(level)
     }
 
     /// Whether a footprint is summed over its texels alone, without a cover: a small one, or a thin one, to which no
     /// square with counts is small; or a Gaussian evenly over a small map.
     fn is_direct(&self, filtered: &FilteredFootprint) -> bool {
         let Some(region) = filtered.region() else {
-            return matches!(self.texels, Texels::Tiles(_)) && self.texel_count() < DIRECT;
+            return self.texel_count() < DIRECT;
         };
         let least = f64::from(self.tree.side(self.finest));
         let thickness = region.area()
@@ -311,7 +250,7 @@ impl CompactBinMap {
                 .iter()
                 .map(|edge| edge.length())
                 .fold(0.0, f64::max);
-        matches!(self.texels, Texels::Tiles(_)) && (region.texel_count() < DIRECT || thickness < least)
+        region.texel_count() < DIRECT || thickness < least
     }
 
     fn scale(&self, footprint: &Footprint, filtered: &FilteredFootprint) -> Scale {
@@ -327,10 +266,7 @@ impl CompactBinMap {
         };
         Scale {
             small,
-            leaf: match self.texels {
-                Texels::Tiles(_) => self.finest,
-                Texels::Blocks(_) => 0,
-            },
+            leaf: self.finest,
         }
     }
 
@@ -390,18 +326,15 @@ impl CompactBinMap {
             low: (0, 0),
             high: self.map,
         };
-        let Texels::Tiles(tiles) = &self.texels else {
-            return;
-        };
         filtered.for_each_part(|part| match part {
-            FilteredPart::Cut(window) => tiles.add(&Border::new(&window), &everything, sums),
+            FilteredPart::Cut(window) => self.texels.add(&Border::new(&window), &everything, sums),
             // Only a map of fewer texels than a small footprint lies inside one entirely.
             FilteredPart::Whole(weight) => {
                 let weight = match self.filter {
                     FootprintFilter::Box => periods(weight, footprint),
                     FootprintFilter::Gaussian { .. } => weight,
                 };
-                tiles.add_all(&everything, weight as f32, sums);
+                self.texels.add_all(&everything, weight as f32, sums);
             }
             FilteredPart::Texel { .. } => {}
         });
@@ -486,14 +419,13 @@ fn periods(weight: f64, footprint: &Footprint) -> f64 {
     (weight * footprint.area()).round()
 }
 
-/// What covers a footprint: counts and blocks wait until there are several to read.
+/// What covers a footprint: counts wait until there are several to read.
 struct Covered<'a> {
     map: &'a CompactBinMap,
     /// Of the footprint, in all periods of the map.
     borders: &'a [Border<'a>],
     /// Small footprints have none.
     counts: Option<CountSum<'a>>,
-    blocks: Option<Reader<'a>>,
     sums: &'a mut Sums,
 }
 
@@ -503,10 +435,6 @@ impl<'a> Covered<'a> {
             map,
             borders,
             counts: None,
-            blocks: match &map.texels {
-                Texels::Blocks(blocks) => Some(Reader::new(blocks, sums)),
-                Texels::Tiles(_) => None,
-            },
             sums,
         }
     }
@@ -533,26 +461,16 @@ impl<'a> Covered<'a> {
             return;
         }
         let rect = self.map.tree.rect(node);
-        let weight = Weight::new(base, self.borders, cuts);
-        match (&self.map.texels, &mut self.blocks) {
-            (_, Some(blocks)) => blocks.add(&rect, weight, self.sums),
-            (Texels::Tiles(tiles), _) => {
-                if base > 0.0 {
-                    tiles.add_all(&rect, base, self.sums);
-                }
-                for border in weight.borders() {
-                    tiles.add(border, &rect, self.sums);
-                }
-            }
-            _ => {}
+        if base > 0.0 {
+            self.map.texels.add_all(&rect, base, self.sums);
+        }
+        for border in Weight::new(base, self.borders, cuts).borders() {
+            self.map.texels.add(border, &rect, self.sums);
         }
     }
 
     /// `parts`: that were covered, and how often each.
     fn finish(self, parts: &[(cover::Part, f64)]) {
-        if let Some(mut blocks) = self.blocks {
-            blocks.flush(self.sums);
-        }
         if let Some(mut counts) = self.counts {
             counts.finish(&self.map.lobe, self.sums);
             let (map, sums) = (self.map, self.sums);
@@ -657,73 +575,36 @@ fn deviation(alpha: f32) -> f64 {
     f64::from(alpha) / std::f64::consts::SQRT_2
 }
 
-/// Sizes of blocks, cells and words: the narrowest words whose cells are not too many; with the widest, coarser normals.
-fn block_geometry(map: (u32, u32), alpha: f32, share: f64, bounds: (Vec2, Vec2)) -> Geometry {
-    let [least, most] = blocks::SIDE_BITS;
-    let side_bits = (least..=most)
-        .rev()
-        .find(|bits| share * f64::from(1_u32 << (2 * bits)) < NEAR_TEXELS)
-        .unwrap_or(least);
-    let pitch = QUANTUM * deviation(alpha);
-    let extent = (bounds.1 - bounds.0).as_dvec2().max(glam::DVec2::splat(pitch));
-    // A box as large as the hemisphere's holds the disk only.
-    let filled = if extent.min_element() > 1.0 { 0.8 } else { 1.0 };
-    let most = |bits: u32| {
-        let left = BYTES_PER_TEXEL - f64::from(bits) / 8.0 - 2.0 / blocks::STRIDE as f64;
-        f64::from(1_u32 << (2 * side_bits)) * (left / 2.0).clamp(1.0 / 16.0, 1.0 / TEXELS_PER_CELL)
-    };
-    let cells = |pitch: f64, cell_bits: u32| {
-        let cell = pitch * f64::from(1_u32 << cell_bits);
-        filled * (extent.x / cell).ceil() * (extent.y / cell).ceil()
-    };
-    let fitting = WIDTHS
-        .into_iter()
-        .filter_map(|bits| Some((bits, (bits / 2).checked_sub(side_bits).filter(|&r| r > 0)?)))
-        .find(|&(bits, cell_bits)| cells(pitch, cell_bits) <= most(bits));
-    let (bits, cell_bits) = fitting.unwrap_or((32, 16 - side_bits));
-    // Cells as small as the directory allows, for the same words; or as large as it must have them.
-    let finer = (cells(pitch, cell_bits) / most(bits)).sqrt();
-    let pitch = pitch
-        * if fitting.is_some() {
-            finer.clamp(0.2, 1.0)
-        } else {
-            finer
-        };
-    Geometry {
-        map,
-        side_bits,
-        cell_bits,
-        grid: Grid::covering(bounds, pitch),
-    }
-}
-
-/// The finest level whose counts fit into what the texels leave, none finer than useful.
-fn finest_counted_level(tree: &Tree, bins: &Grid, least: usize, taken: f64, share: f64) -> usize {
+/// The finest level whose counts, with those of all above it, fit into `left` bytes; none finer than useful.
+fn finest_counted_level(tree: &Tree, bins: &Grid, mut left: f64, share: f64) -> usize {
     let stride = f64::from(bins.size[0]) * f64::from(bins.size[1]);
-    let root = tree.rect(&tree.root());
-    let mut left = BYTES_PER_TEXEL * root.area() - taken;
     let mut finest = tree.levels();
-    for level in (least..tree.levels()).rev() {
-        let texels = f64::from(tree.side(level)).powi(2);
-        // About forty bins are within reach of a normal; the fullest may hold several times their mean, and more than half
-        // of a direction that most texels share.
-        let fullest = if share > counts::CONCENTRATED {
-            0.6
-        } else {
-            6.0 / 40.0
-        };
-        let bytes_per_count = match fullest * texels * share {
-            fullest if fullest < 256.0 => 1.0,
-            fullest if fullest < 65_536.0 => 2.0,
-            _ => 4.0,
-        };
-        left -= bytes_per_count * stride * tree.nodes(level) as f64;
-        if left < 0.0 || texels < 0.6 * stride {
+    for level in (0..tree.levels()).rev() {
+        left -= counts_bytes(tree, bins, level, share);
+        if left < 0.0 || f64::from(tree.side(level)).powi(2) < 0.6 * stride {
             break;
         }
         finest = level;
     }
     finest
+}
+
+/// About so many bytes take the counts of a level.
+fn counts_bytes(tree: &Tree, bins: &Grid, level: usize, share: f64) -> f64 {
+    let texels = f64::from(tree.side(level)).powi(2);
+    // About forty bins are within reach of a normal; the fullest may hold several times their mean, and more than half
+    // of a direction that most texels share.
+    let fullest = if share > counts::CONCENTRATED {
+        0.6
+    } else {
+        6.0 / 40.0
+    };
+    let bytes_per_count = match fullest * texels * share {
+        fullest if fullest < 256.0 => 1.0,
+        fullest if fullest < 65_536.0 => 2.0,
+        _ => 4.0,
+    };
+    bytes_per_count * f64::from(bins.size[0]) * f64::from(bins.size[1]) * tree.nodes(level) as f64
 }
 
 #[cfg(test)]

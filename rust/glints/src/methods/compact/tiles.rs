@@ -1,36 +1,44 @@
-//! Quantised normals in the map's own order: for roughnesses so high that many texels of a footprint matter.
+//! Quantised normals in the map's own order.
 //!
-//! **Layout** Tiles of 8 x 8 texels, row by row. A cell of the [`Grid`] has `8 + k` bits for x and as many for y, k being 2, 4
-//! or 8; a tile holds, texel by texel, the upper 8 of x, the upper 8 of y, and then of both the lower k in `2 k` bits.
+//! **Layout** Tiles of 8 x 8 texels, row by row. A cell of the [`Grid`] has `8 + k` bits for x and `8 + l` for y. One array holds, tile
+//! by tile, the upper 8 of x of all texels and the upper 8 of y: neighbouring tiles are read in one go. Another holds the lower k of x
+//! and l of y as one number of 4, 6, 8 to 16 bits; its bits come in parts of 8, 4 and 2, from the lowest on, each for all texels of
+//! a tile, so that those of a row of texels unpack in a few vector instructions.
 //!
 //! **Query** The upper bytes of a tile are compared with the square around the half vector that holds all within reach: 64
-//! texels in some thirty vector instructions. Of the rows of eight that have any inside, the cells are put together, and
-//! only of those within reach the place is looked at. So it matters little how the footprint's border runs through a tile,
-//! and a thin footprint costs as much as the tiles that it meets.
+//! texels in some thirty vector instructions, or in the time that memory takes for them, about 10 ns. Of the rows of eight that
+//! have any inside, the cells are put together, and only of those within reach the place is looked at. So it matters little how
+//! the footprint's border runs through a tile, and a thin footprint costs as much as the tiles that it meets.
+//!
+//! **Tried** Signatures of tiles, a bit for each of 128 parts of the directions in two to four partitions: for 3 to 4 MB they let a
+//! third to a fifth of the tiles pass at a roughness of 0.007, and reading those in no order takes as long as reading all.
 
 use std::ops::Range;
 
-use glam::{DVec2, Vec2};
+use glam::{DVec2, Vec2, Vec3};
 use rayon::prelude::*;
 use wide::{f32x8, u8x16, u32x8};
 
 use super::border::{Border, Touched, Weight};
 use super::cover::Rect;
 use super::grid::Grid;
-use super::lanes::{LANES, order};
+use super::lanes::{LANES, order, to_float, widened};
 use super::lobes::{Near, Sums};
-use super::packing::{prefetch, to_float, widened};
+use super::memory::prefetch;
 use crate::array::Array;
 use crate::normal_map::NormalMap;
 
 /// Columns and rows of a tile.
 const SIDE: u32 = 8;
 
-/// 32-bit units of a tile's upper bytes: those of x, then those of y.
-const UPPER: usize = 32;
+/// Texels of a tile.
+const TEXELS: usize = 64;
 
-/// The numbers of lower bits that a layout may have.
-const LOWER_BITS: [u32; 3] = [2, 4, 8];
+/// Upper bytes of a tile: those of x, then those of y.
+const UPPER: usize = 2 * TEXELS;
+
+/// The numbers of lower bits of a texel, of x and y together, that a layout may have.
+const LOWER_BITS: [u32; 7] = [4, 6, 8, 10, 12, 14, 16];
 
 /// Tiles that wait for each other.
 const BATCH: usize = 16;
@@ -39,25 +47,36 @@ const BATCH: usize = 16;
 pub struct Tiles {
     map: (u32, u32),
     grid: Grid,
-    /// k.
-    lower_bits: u32,
-    units: Array<u32>,
+    /// k and l.
+    lower_bits: [u32; 2],
+    upper: Array<u8>,
+    lower: Array<u32>,
 }
 
-/// Number of lower bits for a grid, if there is a layout for it.
-pub fn lower_bits(grid: &Grid) -> Option<u32> {
-    LOWER_BITS
-        .into_iter()
-        .find(|bits| grid.size[0].max(grid.size[1]) <= 1 << (8 + bits))
+/// Lower bits of x and y for a grid; more than [`LOWER_BITS`] has, and there is no layout for it.
+pub fn lower_bits(grid: &Grid) -> [u32; 2] {
+    grid.size
+        .map(|cells| cells.next_power_of_two().trailing_zeros().saturating_sub(8))
+}
+
+/// Whether there is a layout for a grid.
+pub fn has_layout(grid: &Grid) -> bool {
+    lower_bits(grid).iter().sum::<u32>() <= LOWER_BITS[LOWER_BITS.len() - 1]
 }
 
 /// The grid over some bounds whose pitch is at most `pitch`, or the finest that cells can tell apart; the finest for as many
 /// bits as that takes.
 pub fn grid(bounds: (Vec2, Vec2), pitch: f64) -> Grid {
-    let extent = f64::from((bounds.1 - bounds.0).max_element()).max(1e-6);
-    let finest = |bits: u32| extent * (1.0 + 1e-6) / f64::from((1_u32 << (8 + bits)) - 1);
+    let extent = (bounds.1 - bounds.0).as_dvec2().max(DVec2::splat(1e-6));
+    // Of all ways to share out the bits.
+    let finest = |bits: u32| {
+        let side = |extent: f64, bits: u32| extent * (1.0 + 1e-6) / f64::from((1_u32 << (8 + bits)) - 1);
+        let pitches = (0..=bits).map(|k| side(extent.x, k).max(side(extent.y, bits - k)));
+        pitches.fold(f64::INFINITY, f64::min)
+    };
+    let [.., most] = LOWER_BITS;
     let fitting = LOWER_BITS.into_iter().map(finest).find(|&finest| finest <= pitch);
-    Grid::covering(bounds, fitting.unwrap_or(finest(8)))
+    Grid::covering(bounds, fitting.unwrap_or(finest(most)))
 }
 
 /// Upper bytes of cells that may be within reach.
@@ -68,7 +87,7 @@ struct Window {
 
 impl Window {
     /// `None`: no cell of the grid is within reach.
-    fn new(sums: &Sums, grid: &Grid, lower_bits: u32) -> Option<Self> {
+    fn new(sums: &Sums, grid: &Grid, lower_bits: [u32; 2]) -> Option<Self> {
         let (center, radius) = sums.window();
         let mut window = Self {
             first: [0; 2],
@@ -80,28 +99,37 @@ impl Window {
             if first > last {
                 return None;
             }
-            let (first, last) = (first as u32 >> lower_bits, last as u32 >> lower_bits);
+            let (first, last) = (first as u32 >> lower_bits[axis], last as u32 >> lower_bits[axis]);
             window.first[axis] = first as u8;
             window.extent[axis] = (last - first) as u8;
         }
         Some(window)
     }
 
-    /// Bit `8 y + x`: the texel may be within reach.
+    /// Sixteen texels from the one `at` on: 255 for those that may be within reach.
     #[inline(always)]
-    fn find(&self, upper: &[u8; 4 * UPPER]) -> u64 {
+    fn sixteen(&self, upper: &[u8; UPPER], at: usize) -> u8x16 {
         let inside = |axis: usize, at: usize| {
             let sixteen: [u8; 16] = upper[at..at + 16].try_into().expect("sixteen bytes");
             // Differences wrap: what is below the first is far above.
             let ahead = u8x16::new(sixteen) - u8x16::splat(self.first[axis]);
             ahead.min(u8x16::splat(self.extent[axis])).cmp_eq(ahead)
         };
-        let mut found = 0;
-        for at in [0, 16, 32, 48] {
-            let both = inside(0, at) & inside(1, 64 + at);
-            found |= u64::from(both.move_mask() as u16) << at;
-        }
-        found
+        inside(0, at) & inside(1, TEXELS + at)
+    }
+
+    /// Whether any texel may be within reach.
+    #[inline(always)]
+    fn finds(&self, upper: &[u8; UPPER]) -> bool {
+        let [a, b, c, d] = [0, 16, 32, 48].map(|at| self.sixteen(upper, at));
+        ((a | b) | (c | d)).move_mask() != 0
+    }
+
+    /// Bit `8 y + x`: the texel may be within reach.
+    #[inline(always)]
+    fn find(&self, upper: &[u8; UPPER]) -> u64 {
+        let mask = |at: usize| u64::from(self.sixteen(upper, at).move_mask() as u16) << at;
+        mask(0) | mask(16) | mask(32) | mask(48)
     }
 }
 
@@ -110,90 +138,143 @@ impl Window {
 struct Asked {
     column: u32,
     row: u32,
-    /// Bit `8 y + x`: the border may touch the texel, or it lies inside.
-    texels: u64,
+    /// The border does not touch it.
     inside: bool,
 }
 
 /// Tiles on their way from memory.
-struct Batch {
+struct Batch<'a> {
     asked: [Asked; BATCH],
     len: usize,
     touched: Touched,
+    /// The border that texels are weighted by; `None`: all weigh the same.
+    border: Option<&'a Border<'a>>,
 }
 
-impl Batch {
-    fn new() -> Self {
+impl<'a> Batch<'a> {
+    fn new(border: Option<&'a Border<'a>>) -> Self {
         Self {
             asked: [Asked::default(); BATCH],
             len: 0,
             touched: Touched::new(),
+            border,
         }
     }
 }
 
 impl Tiles {
-    /// Quantises the map; `grid` is one that [`lower_bits`] has a layout for.
+    /// Quantises the map; `grid` is one that has a layout.
     pub fn new(map: &NormalMap, grid: Grid) -> Self {
         let size = (map.width(), map.height());
-        let (lower_bits, count) = Self::layout(&grid, size);
-        let units = units(lower_bits);
-        let columns = size.0.div_ceil(SIDE) as usize;
-        let mut data = vec![0; count];
-        data.par_chunks_mut(columns * units)
-            .enumerate()
-            .for_each(|(row, data)| {
-                for (column, tile) in data.chunks_exact_mut(units).enumerate() {
-                    for k in 0..SIDE * SIDE {
-                        let column = (column as u32 * SIDE + k % SIDE).min(size.0 - 1);
-                        let row = (row as u32 * SIDE + k / SIDE).min(size.1 - 1);
-                        put(tile, lower_bits, k as usize, grid.cell(map.normal(column, row)));
-                    }
+        let mut tiles = Self::from_parts(size, grid, Default::default());
+        let (upper, lower) = tiles.lengths();
+        let (mut upper, mut lower) = (vec![0; upper], vec![0; lower]);
+        let columns = tiles.size().0 as usize;
+        let units = tiles.units_per_tile();
+        let rows = upper
+            .par_chunks_mut(columns * UPPER)
+            .zip(lower.par_chunks_mut(columns * units));
+        rows.enumerate().for_each(|(row, (upper, lower))| {
+            let tile = upper.chunks_exact_mut(UPPER).zip(lower.chunks_exact_mut(units));
+            for (column, (upper, lower)) in tile.enumerate() {
+                for k in 0..SIDE * SIDE {
+                    let column = (column as u32 * SIDE + k % SIDE).min(size.0 - 1);
+                    let row = (row as u32 * SIDE + k / SIDE).min(size.1 - 1);
+                    tiles.put(upper, lower, k as usize, grid.cell(map.normal(column, row)));
                 }
-            });
-        Self::from_units(size, grid, data.into())
+            }
+        });
+        tiles.upper = upper.into();
+        tiles.lower = lower.into();
+        tiles
     }
 
-    /// The same from units that exist; see [`Tiles::layout`].
-    pub fn from_units(map: (u32, u32), grid: Grid, units: Array<u32>) -> Self {
-        let (lower_bits, _) = Self::layout(&grid, map);
+    /// The same from arrays that exist; see [`Self::lengths`].
+    pub fn from_parts(map: (u32, u32), grid: Grid, (upper, lower): (Array<u8>, Array<u32>)) -> Self {
         Self {
             map,
             grid,
-            lower_bits,
-            units,
+            lower_bits: lower_bits(&grid),
+            upper,
+            lower,
         }
     }
 
-    /// Lower bits for a grid, and 32-bit units of all tiles of a map.
-    pub fn layout(grid: &Grid, (width, height): (u32, u32)) -> (u32, usize) {
-        let bits = lower_bits(grid).unwrap_or(8);
-        let tiles = width.div_ceil(SIDE) as usize * height.div_ceil(SIDE) as usize;
-        (bits, tiles * units(bits))
+    /// Columns and rows of tiles.
+    pub fn size(&self) -> (u32, u32) {
+        tiles_of_map(self.map)
+    }
+
+    /// Upper bytes and 32-bit units of lower bits of all tiles.
+    pub fn lengths(&self) -> (usize, usize) {
+        let (columns, rows) = self.size();
+        let tiles = columns as usize * rows as usize;
+        (tiles * UPPER, tiles * self.units_per_tile())
+    }
+
+    /// Bits of a texel's lower part.
+    #[inline(always)]
+    fn lower_width(&self) -> u32 {
+        (self.lower_bits[0] + self.lower_bits[1])
+            .next_multiple_of(2)
+            .max(LOWER_BITS[0])
+    }
+
+    /// 32-bit units of a tile's lower bits.
+    #[inline(always)]
+    fn units_per_tile(&self) -> usize {
+        TEXELS / 32 * self.lower_width() as usize
+    }
+
+    pub fn bytes(&self) -> usize {
+        self.upper.bytes() + self.lower.bytes()
     }
 
     pub fn grid(&self) -> &Grid {
         &self.grid
     }
 
-    pub fn units(&self) -> &Array<u32> {
-        &self.units
+    /// Upper bytes and lower bits.
+    pub fn parts(&self) -> (&Array<u8>, &Array<u32>) {
+        (&self.upper, &self.lower)
     }
 
     /// The cell of a texel's normal.
     #[inline]
-    pub fn cell(&self, column: u32, row: u32) -> [u32; 2] {
-        let tile = self.tile(column / SIDE, row / SIDE);
+    pub fn cell(&self, (column, row): (u32, u32)) -> [u32; 2] {
+        let (upper, tile) = (
+            self.upper(column / SIDE, row / SIDE),
+            self.lower(column / SIDE, row / SIDE),
+        );
         let k = (row % SIDE * SIDE + column % SIDE) as usize;
-        let upper: &[u8] = bytemuck::cast_slice(&tile[..UPPER]);
-        let bits = self.lower_bits;
-        let (unit, shift) = lower_place(bits, k);
-        let lower = tile[unit] >> shift;
-        let mask = (1 << bits) - 1;
+        let mut lower = 0;
+        for Part { unit, bits, shift } in parts(self.lower_width()) {
+            let bit = k * bits as usize;
+            lower |= (tile[unit + bit / 32] >> (bit % 32) & ((1 << bits) - 1)) << shift;
+        }
+        let [bits_x, bits_y] = self.lower_bits;
         [
-            u32::from(upper[k]) << bits | lower & mask,
-            u32::from(upper[64 + k]) << bits | lower >> bits & mask,
+            u32::from(upper[k]) << bits_x | lower & ((1 << bits_x) - 1),
+            u32::from(upper[TEXELS + k]) << bits_y | lower >> bits_x & ((1 << bits_y) - 1),
         ]
+    }
+
+    /// The normal of a texel.
+    #[inline]
+    pub fn normal(&self, texel: (u32, u32)) -> Vec3 {
+        self.grid.normal(self.cell(texel))
+    }
+
+    /// Writes a cell into a zeroed tile.
+    fn put(&self, upper: &mut [u8], tile: &mut [u32], k: usize, [x, y]: [u32; 2]) {
+        let [bits_x, bits_y] = self.lower_bits;
+        upper[k] = (x >> bits_x) as u8;
+        upper[TEXELS + k] = (y >> bits_y) as u8;
+        let lower = x & ((1 << bits_x) - 1) | (y & ((1 << bits_y) - 1)) << bits_x;
+        for Part { unit, bits, shift } in parts(self.lower_width()) {
+            let bit = k * bits as usize;
+            tile[unit + bit / 32] |= (lower >> shift & ((1 << bits) - 1)) << (bit % 32);
+        }
     }
 
     /// Adds the texels of a footprint inside `rect`, each with its weight. A rectangle begins and ends with a tile, or with the
@@ -203,25 +284,19 @@ impl Tiles {
             return;
         };
         let weight = Weight::new(0.0, std::slice::from_ref(border), &[0]);
-        let mut batch = Batch::new();
+        let mut batch = Batch::new(Some(border));
         let (columns, rows) = tiles_of(rect);
         let rows = rows.start.into()..rows.end.into();
         let is_even = border.is_even();
         for span in border.region.spans_of_rows(DVec2::splat(SIDE.into()), rows) {
+            let row = span.row as u32;
             let clamp = |column: i64| column.clamp(columns.start.into(), columns.end.into()) as u32;
+            let inside = clamp(span.inside.0)..clamp(span.inside.1);
             for column in clamp(span.touched.0)..clamp(span.touched.1) {
-                let row = span.row as u32;
-                let inside = is_even && (span.inside.0..span.inside.1).contains(&i64::from(column));
-                let texels = if inside {
-                    u64::MAX
-                } else {
-                    border.touched(column * SIDE, row * SIDE)
-                };
                 let tile = Asked {
                     column,
                     row,
-                    texels,
-                    inside,
+                    inside: is_even && inside.contains(&column),
                 };
                 self.ask(tile, &mut batch, &window, &weight, sums);
             }
@@ -235,13 +310,12 @@ impl Tiles {
             return;
         };
         let weight = Weight::alike(weight);
-        let mut batch = Batch::new();
+        let mut batch = Batch::new(None);
         let (columns, rows) = tiles_of(rect);
         for (row, column) in rows.flat_map(|row| columns.clone().map(move |column| (row, column))) {
             let tile = Asked {
                 column,
                 row,
-                texels: u64::MAX,
                 inside: true,
             };
             self.ask(tile, &mut batch, &window, &weight, sums);
@@ -249,9 +323,13 @@ impl Tiles {
         self.read(&mut batch, &window, &weight, sums);
     }
 
+    /// Lets a tile wait if any of its texels may be within reach.
     #[inline(always)]
     fn ask(&self, tile: Asked, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
-        prefetch(self.tile(tile.column, tile.row), 0..units(self.lower_bits));
+        if !window.finds(self.upper(tile.column, tile.row)) {
+            return;
+        }
+        prefetch(self.lower(tile.column, tile.row), 0..self.units_per_tile());
         batch.asked[batch.len] = tile;
         batch.len += 1;
         if batch.len == BATCH {
@@ -262,9 +340,14 @@ impl Tiles {
     /// Adds the texels of the tiles that wait.
     #[inline(never)]
     fn read(&self, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
+        let border = batch.border;
         let found = Rows::new(batch, |tile| {
             let (column, row) = (tile.column, tile.row);
-            window.find(upper(self.tile(column, row))) & tile.texels & self.within(column, row)
+            let found = window.find(self.upper(column, row)) & self.within(column, row);
+            match border {
+                Some(border) if !tile.inside => found & border.touched(column * SIDE, row * SIDE),
+                _ => found,
+            }
         });
         let alike = if weight.cuts.is_empty() { weight.base } else { 1.0 };
         let Batch { asked, touched, .. } = batch;
@@ -272,8 +355,7 @@ impl Tiles {
             let Asked {
                 column, row, inside, ..
             } = asked[slot];
-            let tile = self.tile(column, row);
-            let (x, y) = self.cells(tile, upper(tile), k as usize);
+            let (x, y) = self.cells(column, row, k as usize);
             let lanes = lanes & sums.near(x, y);
             if inside {
                 sums.add_alike(lanes, x, y, alike);
@@ -301,35 +383,51 @@ impl Tiles {
 
     /// Cells of a row of a tile.
     #[inline(always)]
-    fn cells(&self, tile: &[u32], upper: &[u8; 4 * UPPER], row: usize) -> (f32x8, f32x8) {
-        let bits = self.lower_bits;
+    fn cells(&self, column: u32, tile_row: u32, row: usize) -> (f32x8, f32x8) {
+        let (upper, tile) = (self.upper(column, tile_row), self.lower(column, tile_row));
         let eight = |at: usize| {
             let bytes: &[u8; 8] = upper[at..at + 8].try_into().expect("eight bytes");
             widened(bytes)
         };
-        let lower = match bits {
-            2 => u32x8::splat(tile[UPPER + row]) >> u32x8::new([0, 4, 8, 12, 16, 20, 24, 28]),
-            4 => {
-                let [a, b] = [tile[UPPER + 2 * row], tile[UPPER + 2 * row + 1]];
-                u32x8::new([a, a, a, a, b, b, b, b]) >> u32x8::new([0, 8, 16, 24, 0, 8, 16, 24])
-            }
-            _ => {
-                let units: [u32; 4] = tile[UPPER + 4 * row..][..4].try_into().expect("four units");
-                let [a, b, c, d] = units;
-                u32x8::new([a, a, b, b, c, c, d, d]) >> u32x8::new([0, 16, 0, 16, 0, 16, 0, 16])
-            }
-        };
-        let mask = u32x8::splat((1 << bits) - 1);
-        let x = eight(8 * row) << bits | lower & mask;
-        let y = eight(64 + 8 * row) << bits | lower >> bits & mask;
+        let mut lower = u32x8::ZERO;
+        for Part { unit, bits, shift } in parts(self.lower_width()) {
+            let part = match bits {
+                8 => {
+                    let [a, b] = [tile[unit + 2 * row], tile[unit + 2 * row + 1]];
+                    u32x8::new([a, a, a, a, b, b, b, b]) >> u32x8::new([0, 8, 16, 24, 0, 8, 16, 24])
+                }
+                4 => u32x8::splat(tile[unit + row]) >> u32x8::new([0, 4, 8, 12, 16, 20, 24, 28]),
+                _ => {
+                    let pairs = tile[unit + row / 2] >> (row % 2 * 16);
+                    u32x8::splat(pairs) >> u32x8::new([0, 2, 4, 6, 8, 10, 12, 14])
+                }
+            };
+            lower |= (part & u32x8::splat((1 << bits) - 1)) << shift;
+        }
+        let [bits_x, bits_y] = self.lower_bits;
+        let mask = |bits: u32| u32x8::splat((1 << bits) - 1);
+        let x = eight(8 * row) << bits_x | lower & mask(bits_x);
+        let y = eight(TEXELS + 8 * row) << bits_y | lower >> bits_x & mask(bits_y);
         (to_float(x), to_float(y))
     }
 
     #[inline(always)]
-    fn tile(&self, column: u32, row: u32) -> &[u32] {
-        let index = row as usize * self.map.0.div_ceil(SIDE) as usize + column as usize;
-        let units = units(self.lower_bits);
-        &self.units[index * units..][..units]
+    fn index(&self, column: u32, row: u32) -> usize {
+        row as usize * self.map.0.div_ceil(SIDE) as usize + column as usize
+    }
+
+    /// The upper bytes of a tile.
+    #[inline(always)]
+    fn upper(&self, column: u32, row: u32) -> &[u8; UPPER] {
+        let bytes = &self.upper[self.index(column, row) * UPPER..][..UPPER];
+        bytes.try_into().expect("the upper bytes")
+    }
+
+    /// The lower bits of a tile.
+    #[inline(always)]
+    fn lower(&self, column: u32, row: u32) -> &[u32] {
+        let units = self.units_per_tile();
+        &self.lower[self.index(column, row) * units..][..units]
     }
 }
 
@@ -388,34 +486,31 @@ fn rows_with_any(found: u64) -> u32 {
     ((any >> 7).wrapping_mul(0x0102_0408_1020_4080) >> 56) as u32
 }
 
-/// The upper bytes of a tile.
+/// Bits of the lower numbers of a tile.
+struct Part {
+    /// First unit.
+    unit: usize,
+    bits: u32,
+    /// Their place in the number.
+    shift: u32,
+}
+
+/// The parts of lower numbers of `width` bits.
 #[inline(always)]
-fn upper(tile: &[u32]) -> &[u8; 4 * UPPER] {
-    bytemuck::cast_slice(&tile[..UPPER])
-        .try_into()
-        .expect("the upper bytes")
+fn parts(width: u32) -> impl Iterator<Item = Part> {
+    let (mut unit, mut shift) = (0, 0);
+    std::iter::from_fn(move || {
+        let bits = [8, 4, 2].into_iter().find(|&bits| bits <= width - shift)?;
+        let part = Part { unit, bits, shift };
+        unit += TEXELS / 32 * bits as usize;
+        shift += bits;
+        Some(part)
+    })
 }
 
-/// 32-bit units of a tile.
-const fn units(lower_bits: u32) -> usize {
-    UPPER + 4 * lower_bits as usize
-}
-
-/// Unit and shift of the lower bits of a texel.
-#[inline]
-fn lower_place(lower_bits: u32, texel: usize) -> (usize, u32) {
-    let bit = texel * 2 * lower_bits as usize;
-    (UPPER + bit / 32, bit as u32 % 32)
-}
-
-/// Writes a cell into a zeroed tile.
-fn put(tile: &mut [u32], lower_bits: u32, texel: usize, [x, y]: [u32; 2]) {
-    let upper: &mut [u8] = bytemuck::cast_slice_mut(&mut tile[..UPPER]);
-    upper[texel] = (x >> lower_bits) as u8;
-    upper[64 + texel] = (y >> lower_bits) as u8;
-    let mask = (1 << lower_bits) - 1;
-    let (unit, shift) = lower_place(lower_bits, texel);
-    tile[unit] |= (x & mask | (y & mask) << lower_bits) << shift;
+/// Columns and rows of the tiles of a map.
+pub fn tiles_of_map((width, height): (u32, u32)) -> (u32, u32) {
+    (width.div_ceil(SIDE), height.div_ceil(SIDE))
 }
 
 /// Columns and rows of the tiles of a rectangle.
