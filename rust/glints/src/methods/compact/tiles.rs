@@ -17,7 +17,7 @@ use std::ops::Range;
 
 use glam::{DVec2, Vec2, Vec3};
 use rayon::prelude::*;
-use wide::{f32x8, u8x16, u32x8};
+use wide::{CmpGt, f32x8, i8x32, u32x8};
 
 use super::border::{Border, Touched, Weight};
 use super::cover::Rect;
@@ -81,8 +81,10 @@ pub fn grid(bounds: (Vec2, Vec2), pitch: f64) -> Grid {
 
 /// Upper bytes of cells that may be within reach.
 struct Window {
-    first: [u8; 2],
-    extent: [u8; 2],
+    /// Of x and y, 128 more than the first byte, and 128 less than how far the last one is ahead of it: so that signed
+    /// numbers compare.
+    first: [i8x32; 2],
+    extent: [i8x32; 2],
 }
 
 impl Window {
@@ -90,8 +92,8 @@ impl Window {
     fn new(sums: &Sums, grid: &Grid, lower_bits: [u32; 2]) -> Option<Self> {
         let (center, radius) = sums.window();
         let mut window = Self {
-            first: [0; 2],
-            extent: [0; 2],
+            first: [i8x32::ZERO; 2],
+            extent: [i8x32::ZERO; 2],
         };
         for (axis, &center) in center.iter().enumerate() {
             let first = (center - radius).ceil().max(0.0);
@@ -99,37 +101,38 @@ impl Window {
             if first > last {
                 return None;
             }
-            let (first, last) = (first as u32 >> lower_bits[axis], last as u32 >> lower_bits[axis]);
-            window.first[axis] = first as u8;
-            window.extent[axis] = (last - first) as u8;
+            let [first, last] = [first, last].map(|cell| (cell as u32 >> lower_bits[axis]) as u8);
+            let splat = |byte: u8| i8x32::splat(byte.wrapping_add(128) as i8);
+            window.first[axis] = splat(first);
+            window.extent[axis] = splat(last - first);
         }
         Some(window)
     }
 
-    /// Sixteen texels from the one `at` on: 255 for those that may be within reach.
+    /// Half of the texels of a tile: not zero for those that are out of reach.
     #[inline(always)]
-    fn sixteen(&self, upper: &[u8; UPPER], at: usize) -> u8x16 {
-        let inside = |axis: usize, at: usize| {
-            let sixteen: [u8; 16] = upper[at..at + 16].try_into().expect("sixteen bytes");
-            // Differences wrap: what is below the first is far above.
-            let ahead = u8x16::new(sixteen) - u8x16::splat(self.first[axis]);
-            ahead.min(u8x16::splat(self.extent[axis])).cmp_eq(ahead)
+    fn outside(&self, upper: &[u8; UPPER], half: usize) -> i8x32 {
+        let beyond = |axis: usize| {
+            let bytes: [u8; 32] = upper[axis * TEXELS + 32 * half..][..32]
+                .try_into()
+                .expect("32 bytes");
+            // Differences wrap: what is below the first is far ahead.
+            (i8x32::new(bytemuck::cast(bytes)) - self.first[axis]).cmp_gt(self.extent[axis])
         };
-        inside(0, at) & inside(1, TEXELS + at)
+        beyond(0) | beyond(1)
     }
 
     /// Whether any texel may be within reach.
     #[inline(always)]
     fn finds(&self, upper: &[u8; UPPER]) -> bool {
-        let [a, b, c, d] = [0, 16, 32, 48].map(|at| self.sixteen(upper, at));
-        ((a | b) | (c | d)).move_mask() != 0
+        (self.outside(upper, 0) & self.outside(upper, 1)).move_mask() != -1
     }
 
     /// Bit `8 y + x`: the texel may be within reach.
     #[inline(always)]
     fn find(&self, upper: &[u8; UPPER]) -> u64 {
-        let mask = |at: usize| u64::from(self.sixteen(upper, at).move_mask() as u16) << at;
-        mask(0) | mask(16) | mask(32) | mask(48)
+        let [low, high] = [0, 1].map(|half| u64::from(self.outside(upper, half).move_mask() as u32));
+        !(low | high << 32)
     }
 }
 
@@ -323,9 +326,17 @@ impl Tiles {
         self.read(&mut batch, &window, &weight, sums);
     }
 
+    /// Asks for a tile's upper bytes: those of a row come in one go, and the next row's would be waited for.
+    #[inline(always)]
+    fn prefetch(&self, column: u32, row: u32) {
+        let first = self.index(column, row) * UPPER;
+        prefetch(&self.upper, first..first + UPPER);
+    }
+
     /// Lets a tile wait if any of its texels may be within reach.
     #[inline(always)]
     fn ask(&self, tile: Asked, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
+        self.prefetch(tile.column, tile.row + 1);
         if !window.finds(self.upper(tile.column, tile.row)) {
             return;
         }
