@@ -27,8 +27,7 @@ use super::cover::{Node, Tree};
 use super::grid::Grid;
 use super::lanes::{LANES, to_float, widened};
 use super::lobes::{Lobe, Normals, Sums};
-use super::memory::prefetch;
-use crate::array::Array;
+use crate::array::{Array, prefetch};
 
 /// Width of a bin in standard deviations of a lobe, `alpha / sqrt 2`; the paper has 1.2 (Eq. 16 of Atanasov et al. 2021).
 /// Wider ones show through the lobes that are left.

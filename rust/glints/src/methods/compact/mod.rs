@@ -72,7 +72,6 @@ mod file;
 mod grid;
 mod lanes;
 mod lobes;
-mod memory;
 mod strays;
 mod tiles;
 
