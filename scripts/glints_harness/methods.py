@@ -168,7 +168,7 @@ def glints(name, label, kind, memory, parameters=None, **more):
 
 
 COMPACT_MEMORY = Formula(
-    "at most 4.35 N, from 2.5 N on: normals in 20 to 32 bits a texel, the rest their directory and counts",
+    "at most 4.35 N, from 2.5 N on: normals in 20 to 32 bits a texel, the rest counts",
     lambda texels, *_: 4.35 * texels,
 )
 BIN_MAP_MEMORY = Formula(
