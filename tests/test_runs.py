@@ -312,7 +312,7 @@ OPTIONS = (
     "--tiling",
     "1",
     "--spp",
-    "1,16",
+    "1,256",
     "--seeds",
     "4",
     "--reference-spp",
