@@ -46,6 +46,8 @@
 //!   texels are tested. (A former version sorted the texels by direction, in blocks, and read the few cells around the half vector: 2 to
 //!   20 microseconds there. To find the one at a given place then took 4 microseconds, a chain of cache misses along the
 //!   inverse of the sort, for every sample of every footprint. Both orders together take the memory of the published structure.)
+//! * footprints of several periods of a large map at a roughness so low that only the root has counts: they do not count as even
+//!   before they are very large, as nothing tells how much parts of the map deviate, and milliseconds pass.
 //!
 //! **Gaussian footprints** ([`CompactBinMap::with_filter`], [`crate::footprint_filter`]) go the same ways. No two texels weigh
 //! the same, so that single texels are weighted one by one where they are near the half vector, eight at a time ([`border`]),
