@@ -1,8 +1,8 @@
 //! Areas of the texels that the border of a footprint cuts.
 //!
 //! Of the texels of a square that the border cuts, few are near the half vector. Those wait here ([`Touched`]) until there
-//! are several; then the share of their squares inside the footprint is computed for eight at once. A footprint that wraps around the map has
-//! several borders there, and a texel the sum of its shares ([`Weight`]).
+//! are several; then the share of their squares inside the footprint is computed for eight at once. A footprint that wraps
+//! around the map has several borders there, which are added one by one.
 //!
 //! **Computes** A footprint is `|s| <= 1/2, |t| <= 1/2` of two linear functions. A square that only `|s| = 1/2` cuts has the
 //! share `f(1/2 - s) + f(1/2 + s) - 1` inside, with s at its middle, gradient `(g_x, g_y)`, `a >= b` the greater and the
@@ -81,52 +81,6 @@ struct Series {
     peak: f32,
 }
 
-/// What the texels of a square weigh: a number, and the areas inside some of several borders.
-#[derive(Clone, Copy)]
-pub struct Weight<'a> {
-    pub base: f32,
-    pub borders: &'a [Border<'a>],
-    /// Which of the borders count.
-    pub cuts: &'a [u16],
-    /// The border, if one is all there is and what lies inside weighs one.
-    only: Option<&'a Border<'a>>,
-}
-
-impl<'a> Weight<'a> {
-    pub fn new(base: f32, borders: &'a [Border<'a>], cuts: &'a [u16]) -> Self {
-        let only = match cuts {
-            &[cut] if base == 0.0 => borders.get(usize::from(cut)).filter(|border| border.is_even()),
-            _ => None,
-        };
-        Self {
-            base,
-            borders,
-            cuts,
-            only,
-        }
-    }
-
-    /// The same for all texels.
-    pub fn alike(base: f32) -> Self {
-        Self::new(base, &[], &[])
-    }
-
-    /// The borders that count.
-    pub fn borders(&self) -> impl Iterator<Item = &'a Border<'a>> + use<'a> {
-        let borders = self.borders;
-        self.cuts
-            .iter()
-            .filter_map(move |&cut| borders.get(usize::from(cut)))
-    }
-
-    /// Weights of the texels of `lanes`; those of the others say nothing.
-    #[inline]
-    pub fn of(&self, lanes: u32, columns: f32x8, rows: f32x8) -> f32x8 {
-        let weights = self.borders().map(|border| border.weights(lanes, columns, rows));
-        weights.fold(f32x8::splat(self.base), |sum, weights| sum + weights)
-    }
-}
-
 /// Texels that may be within reach and that the border may cut. They wait until there are several groups.
 pub struct Touched {
     x: [f32; QUEUE],
@@ -150,12 +104,12 @@ impl Touched {
         }
     }
 
-    /// Adds texels at `columns` and `rows`, that weigh what `weight` says. Most lie inside the only border, or outside: those
+    /// Adds texels at `columns` and `rows`. Of those that weigh the same inside the border, most lie inside, or outside: they
     /// need not wait.
     #[inline(always)]
-    pub fn add(&mut self, near: &Near, [columns, rows]: [f32x8; 2], weight: &Weight, sums: &mut Sums) {
+    pub fn add(&mut self, near: &Near, [columns, rows]: [f32x8; 2], border: &Border, sums: &mut Sums) {
         let mut lanes = near.lanes;
-        if let Some(border) = weight.only {
+        if border.is_even() {
             let (touched, inside) = border.sides(columns, rows);
             sums.add_alike(lanes & inside, near.x, near.y, 1.0);
             lanes &= touched & !inside;
@@ -169,16 +123,16 @@ impl Touched {
         compress(lanes, rows, &mut self.rows, self.len);
         self.len += lanes.count_ones() as usize;
         if self.len > QUEUE - 8 {
-            self.flush(weight, sums);
+            self.flush(border, sums);
         }
     }
 
-    /// Adds what waits. To be called before the weight changes.
+    /// Adds what waits. To be called before the border changes.
     #[inline(never)]
-    pub fn flush(&mut self, weight: &Weight, sums: &mut Sums) {
+    pub fn flush(&mut self, border: &Border, sums: &mut Sums) {
         for start in (0..self.len).step_by(8) {
             let lanes = (1 << (self.len - start).min(8)) - 1;
-            let weights = weight.of(lanes, eight(&self.columns, start), eight(&self.rows, start));
+            let weights = border.weights(lanes, eight(&self.columns, start), eight(&self.rows, start));
             sums.add(lanes, eight(&self.x, start), eight(&self.y, start), weights);
         }
         self.len = 0;

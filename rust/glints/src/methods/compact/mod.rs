@@ -88,7 +88,7 @@ use crate::footprint_filter::{FilteredFootprint, FilteredPart, FootprintFilter, 
 use crate::half_vector::DirectionPair;
 use crate::hash::mix;
 use crate::normal_map::NormalMap;
-use border::{Border, Weight};
+use border::Border;
 use counts::{CountSum, Counts};
 use cover::{Node, Rect, Scale, Treatment, Tree};
 use grid::Grid;
@@ -465,8 +465,10 @@ impl<'a> Covered<'a> {
         if base > 0.0 {
             self.map.texels.add_all(&rect, base, self.sums);
         }
-        for border in Weight::new(base, self.borders, cuts).borders() {
-            self.map.texels.add(border, &rect, self.sums);
+        for &cut in cuts {
+            self.map
+                .texels
+                .add(&self.borders[usize::from(cut)], &rect, self.sums);
         }
     }
 

@@ -19,7 +19,7 @@ use glam::{DVec2, Vec2, Vec3};
 use rayon::prelude::*;
 use wide::{CmpGt, f32x8, i8x32, u32x8};
 
-use super::border::{Border, Touched, Weight};
+use super::border::{Border, Touched};
 use super::cover::Rect;
 use super::grid::Grid;
 use super::lanes::{LANES, order, to_float, widened};
@@ -149,17 +149,23 @@ struct Batch<'a> {
     asked: [Asked; BATCH],
     len: usize,
     touched: Touched,
-    /// The border that texels are weighted by; `None`: all weigh the same.
-    border: Option<&'a Border<'a>>,
+    weight: Weight<'a>,
+}
+
+/// What the texels of tiles weigh.
+#[derive(Clone, Copy)]
+enum Weight<'a> {
+    Alike(f32),
+    Inside(&'a Border<'a>),
 }
 
 impl<'a> Batch<'a> {
-    fn new(border: Option<&'a Border<'a>>) -> Self {
+    fn new(weight: Weight<'a>) -> Self {
         Self {
             asked: [Asked::default(); BATCH],
             len: 0,
             touched: Touched::new(),
-            border,
+            weight,
         }
     }
 }
@@ -285,8 +291,7 @@ impl Tiles {
         let Some(window) = Window::new(sums, &self.grid, self.lower_bits) else {
             return;
         };
-        let weight = Weight::new(0.0, std::slice::from_ref(border), &[0]);
-        let mut batch = Batch::new(Some(border));
+        let mut batch = Batch::new(Weight::Inside(border));
         let (columns, rows) = tiles_of(rect);
         let rows = rows.start.into()..rows.end.into();
         let is_even = border.is_even();
@@ -301,10 +306,10 @@ impl Tiles {
                     row,
                     inside: is_even && inside.contains(&column),
                 };
-                self.ask(tile, &mut batch, &window, &weight, sums);
+                self.ask(tile, &mut batch, &window, sums);
             });
         }
-        self.read(&mut batch, &window, &weight, sums);
+        self.read(&mut batch, &window, sums);
     }
 
     /// Adds all texels of `rect`, which begins and ends with a tile, or with the map, each with the weight `weight`.
@@ -312,8 +317,7 @@ impl Tiles {
         let Some(window) = Window::new(sums, &self.grid, self.lower_bits) else {
             return;
         };
-        let weight = Weight::alike(weight);
-        let mut batch = Batch::new(None);
+        let mut batch = Batch::new(Weight::Alike(weight));
         let (columns, rows) = tiles_of(rect);
         for row in rows {
             self.for_each_near(&window, row, columns.clone(), |column| {
@@ -322,10 +326,10 @@ impl Tiles {
                     row,
                     inside: true,
                 };
-                self.ask(tile, &mut batch, &window, &weight, sums);
+                self.ask(tile, &mut batch, &window, sums);
             });
         }
-        self.read(&mut batch, &window, &weight, sums);
+        self.read(&mut batch, &window, sums);
     }
 
     /// Calls `visit` with the columns of a row's tiles that may have a texel within reach.
@@ -347,28 +351,27 @@ impl Tiles {
 
     /// Lets a tile wait that may have a texel within reach.
     #[inline(always)]
-    fn ask(&self, tile: Asked, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
+    fn ask(&self, tile: Asked, batch: &mut Batch, window: &Window, sums: &mut Sums) {
         prefetch(self.lower(tile.column, tile.row), 0..self.units_per_tile());
         batch.asked[batch.len] = tile;
         batch.len += 1;
         if batch.len == BATCH {
-            self.read(batch, window, weight, sums);
+            self.read(batch, window, sums);
         }
     }
 
     /// Adds the texels of the tiles that wait.
     #[inline(never)]
-    fn read(&self, batch: &mut Batch, window: &Window, weight: &Weight, sums: &mut Sums) {
-        let border = batch.border;
+    fn read(&self, batch: &mut Batch, window: &Window, sums: &mut Sums) {
+        let weight = batch.weight;
         let found = Rows::new(batch, |tile| {
             let (column, row) = (tile.column, tile.row);
             let found = window.find(self.upper(column, row)) & self.within(column, row);
-            match border {
-                Some(border) if !tile.inside => found & border.touched(column * SIDE, row * SIDE),
+            match weight {
+                Weight::Inside(border) if !tile.inside => found & border.touched(column * SIDE, row * SIDE),
                 _ => found,
             }
         });
-        let alike = if weight.cuts.is_empty() { weight.base } else { 1.0 };
         let Batch { asked, touched, .. } = batch;
         for (slot, k, lanes) in found.iter() {
             let Asked {
@@ -376,15 +379,19 @@ impl Tiles {
             } = asked[slot];
             let (x, y) = self.cells(column, row, k as usize);
             let lanes = lanes & sums.near(x, y);
-            if inside {
-                sums.add_alike(lanes, x, y, alike);
-            } else {
-                let columns = LANES + (column * SIDE) as f32;
-                let rows = f32x8::splat((row * SIDE + k) as f32);
-                touched.add(&Near { lanes, x, y }, [columns, rows], weight, sums);
+            match weight {
+                Weight::Alike(weight) => sums.add_alike(lanes, x, y, weight),
+                Weight::Inside(_) if inside => sums.add_alike(lanes, x, y, 1.0),
+                Weight::Inside(border) => {
+                    let columns = LANES + (column * SIDE) as f32;
+                    let rows = f32x8::splat((row * SIDE + k) as f32);
+                    touched.add(&Near { lanes, x, y }, [columns, rows], border, sums);
+                }
             }
         }
-        touched.flush(weight, sums);
+        if let Weight::Inside(border) = weight {
+            touched.flush(border, sums);
+        }
         batch.len = 0;
     }
 
