@@ -59,8 +59,11 @@ pub const PADDING: usize = 32;
 /// Bins along a side of the squares over which distributions are compared.
 const SQUARE: usize = 4;
 
+/// Texels that tell how much the map's quarters deviate, if nothing else does.
+const SPARSE: u32 = 1 << 17;
+
 /// Bound of the relative deviation of a node's part from the node.
-const LARGEST_DEVIATION: f64 = 1.0;
+pub const LARGEST_DEVIATION: f64 = 1.0;
 
 /// See the module.
 pub struct Counts {
@@ -217,14 +220,19 @@ impl Counts {
 
     /// How much the distribution of a node's part deviates from the node's, relatively, for the nodes of each level: that of
     /// its quarters, over squares of bins about as large as a lobe. Quarters that have no counts are taken to deviate twice
-    /// as much as those of the next level, as by chance.
-    pub fn deviations(&self, tree: &Tree) -> Vec<f64> {
+    /// as much as those of the next level, as by chance. Where only the root has counts, `normal`, that of a texel, tells.
+    pub fn deviations(&self, tree: &Tree, normal: impl Fn((u32, u32)) -> Vec3) -> Vec<f64> {
         let mut deviations = vec![LARGEST_DEVIATION; tree.levels()];
-        for (below, pair) in self.levels.windows(2).enumerate() {
-            if let [Some(finer), Some(level)] = pair {
-                let measured = self.deviation(tree, below + 1, level, finer);
-                deviations[below + 1] = measured.min(LARGEST_DEVIATION);
-            }
+        let mut below = LARGEST_DEVIATION;
+        for (index, deviation) in deviations.iter_mut().enumerate().skip(1) {
+            let measured = match (self.levels.get(index - 1), self.levels.get(index)) {
+                (Some(Some(finer)), Some(Some(level))) => self.deviation(tree, index, level, finer),
+                (_, Some(Some(_))) if index == tree.levels() - 1 => self.deviation_of_root(tree, &normal),
+                _ => continue,
+            };
+            // Nodes without halves, as of a long map, deviate no more than the finer ones.
+            below = measured.unwrap_or(below).min(LARGEST_DEVIATION);
+            *deviation = below;
         }
         for index in (0..tree.levels() - 1)
             .rev()
@@ -235,40 +243,92 @@ impl Counts {
         deviations
     }
 
-    /// `sqrt 3` times that of a node's halves, which is as for quarters where texels are independent. Where left and right
-    /// halves deviate otherwise than upper and lower ones, streaks make neighbours alike: the greater, times the root of its
-    /// ratio to the lesser.
-    fn deviation(&self, tree: &Tree, index: usize, level: &Level, finer: &Level) -> f64 {
+    /// From the counts of some nodes of a level and of their quarters.
+    fn deviation(&self, tree: &Tree, index: usize, level: &Level, finer: &Level) -> Option<f64> {
         let nodes = tree.nodes(index);
         // Few nodes tell; a prime number of nodes apart, so that no pattern of the map is met.
         let step = [1, 3, 7, 17, 61, 251]
             .into_iter()
             .rfind(|step| step * 64 <= nodes)
             .unwrap_or(1);
-        let sums: Vec<[f64; 3]> = (0..nodes.div_ceil(step))
+        let sums: Vec<[[f64; 2]; 2]> = (0..nodes.div_ceil(step))
             .into_par_iter()
-            .filter_map(|k| {
+            .map(|k| {
                 let node = tree.node(index, k * step);
-                let children: Vec<Node> = tree.children(&node).collect();
-                let [a, b, c, _]: [Vec<f64>; 4] = children
-                    .iter()
-                    .map(|child| self.squares(finer, tree.index(child)))
-                    .collect::<Vec<_>>()
-                    .try_into()
-                    .ok()?;
                 let whole = self.squares(level, tree.index(&node));
-                let difference = |one: &[f64], other: &[f64]| -> f64 {
-                    let halves = one.iter().zip(other).zip(&whole);
-                    halves
-                        .map(|((one, other), whole)| (2.0 * (one + other) - whole).abs())
-                        .sum()
-                };
-                Some([difference(&a, &b), difference(&a, &c), whole.iter().sum()])
+                let children: Vec<(Node, Vec<f64>)> = tree
+                    .children(&node)
+                    .map(|child| (child, self.squares(finer, tree.index(&child))))
+                    .collect();
+                tree.halves(&node).map(|half| {
+                    let Some(half) = half else { return [0.0; 2] };
+                    let inside = children.iter().filter(|(child, _)| half.holds(child));
+                    let mut part = vec![0.0; whole.len()];
+                    for (_, squares) in inside {
+                        part.iter_mut()
+                            .zip(squares)
+                            .for_each(|(sum, count)| *sum += count);
+                    }
+                    let apart = |(part, whole): (&f64, &f64)| (part / half.share - whole).abs();
+                    let sum: f64 = part.iter().zip(&whole).map(apart).sum();
+                    [sum * half.by_chance(), whole.iter().sum()]
+                })
             })
             .collect();
-        let total = |k: usize| sums.iter().map(|sum| sum[k]).sum::<f64>();
-        let (greater, lesser) = (total(0).max(total(1)), total(0).min(total(1)));
-        (3.0 * greater / lesser.max(1e-9)).sqrt() * greater / total(2).max(1.0)
+        of_quarters([0, 1].map(|axis| {
+            let total = |k: usize| sums.iter().map(|sum| sum[axis][k]).sum::<f64>();
+            (total(1) > 0.0).then(|| total(0) / total(1))
+        }))
+    }
+
+    /// From some of the map's texels, in no order. What they deviate more than by chance the map does too; chance is that of all texels.
+    pub fn deviation_of_root(&self, tree: &Tree, normal: impl Fn((u32, u32)) -> Vec3) -> Option<f64> {
+        let root = tree.root();
+        let rect = tree.rect(&root);
+        let [columns, rows] = self.bins.size.map(|side| side as usize);
+        let stride = columns.div_ceil(SQUARE);
+        let halves = tree.halves(&root);
+        // Of each square: its texels, and those in the left and in the upper half.
+        let mut squares = vec![[0.0_f64; 3]; stride * rows.div_ceil(SQUARE)];
+        for k in 0..SPARSE {
+            let place = |bits: u32, side: u32| ((u64::from(bits) * u64::from(side)) >> 32) as u32;
+            let texel = (place(hash(k, 0), rect.high.0), place(hash(k, 1), rect.high.1));
+            let normal = normal(texel);
+            if !Self::holds(&self.bins, normal) {
+                continue;
+            }
+            let cell = (project(normal) - self.bins.low) / self.bins.pitch;
+            let square = &mut squares[cell.y as usize / SQUARE * stride + cell.x as usize / SQUARE];
+            square[0] += 1.0;
+            for (count, half) in square[1..].iter_mut().zip(&halves) {
+                *count += f64::from(half.as_ref().is_some_and(|half| half.has(texel)));
+            }
+        }
+        squares.retain(|square| square[0] > 0.0);
+        let count: f64 = squares.iter().map(|square| square[0]).sum();
+        let by_chance = squares.len() as f64 / rect.area();
+        let [left, upper] = halves;
+        of_quarters([(1, left), (2, upper)].map(|(axis, half)| {
+            let half = half?;
+            let excess = |square: &[f64; 3]| {
+                let apart = (square[axis] / half.share - square[0]) * half.by_chance();
+                apart * apart / square[0] - 1.0
+            };
+            let excess = squares.iter().map(excess).sum::<f64>() / count;
+            Some((excess.max(0.0) + by_chance).sqrt())
+        }))
+    }
+
+    /// Mean density of the map's normals per solid angle at the normals themselves, over squares of bins; of none, zero.
+    pub fn mean_density(&self, tree: &Tree) -> f64 {
+        let Some(Some(level)) = self.levels.get(tree.levels() - 1) else {
+            return 0.0;
+        };
+        let squares = self.squares(level, 0);
+        let count: f64 = squares.iter().sum();
+        let squared: f64 = squares.iter().map(|count| count * count).sum();
+        let solid_angle = 2.0 * (SQUARE as f64 * f64::from(self.bins.pitch)).powi(2);
+        squared / (count * count).max(1.0) / solid_angle
     }
 
     /// Counts of a node over squares of bins.
@@ -498,6 +558,15 @@ impl<'a> CountSum<'a> {
     }
 }
 
+/// How much quarters deviate, from left and upper halves, where there are any: `sqrt 3` times as much, which is right where texels
+/// are independent. Where left and right halves deviate otherwise than upper and lower ones, streaks make neighbours alike: the
+/// greater, times the root of its ratio to the lesser.
+fn of_quarters(halves: [Option<f64>; 2]) -> Option<f64> {
+    let [left, upper] = [halves[0].or(halves[1])?, halves[1].or(halves[0])?];
+    let (greater, lesser) = (left.max(upper), left.min(upper));
+    Some((3.0 * greater / lesser.max(1e-9)).sqrt() * greater)
+}
+
 /// Adds to a number that no other thread adds to.
 #[inline(always)]
 fn add(sum: &AtomicU32, number: u32) {
@@ -575,7 +644,8 @@ mod tests {
         sum.sums.truncate(sum.rows * sum.columns);
         sum.add(tree, &tree.root(), 1.0 / tree.rect(&tree.root()).area() as f32);
         sum.finish(lobe, &mut sums);
-        sums.totals()
+        let found = sums.totals(1.0);
+        (found.value, found.density)
     }
 
     const ALL: usize = usize::MAX;

@@ -80,6 +80,35 @@ impl Node {
     }
 }
 
+/// The left or the upper half of a node.
+#[derive(Clone, Copy, Debug)]
+pub struct Half {
+    axis: usize,
+    /// First column or row of the other half, in texels and in nodes of the next finer level.
+    end: u32,
+    end_node: u32,
+    /// Of the node's texels.
+    pub share: f64,
+}
+
+impl Half {
+    /// Whether it holds a texel of the node.
+    #[inline]
+    pub fn has(&self, texel: (u32, u32)) -> bool {
+        [texel.0, texel.1][self.axis] < self.end
+    }
+
+    /// Whether it holds a quarter of the node.
+    pub fn holds(&self, child: &Node) -> bool {
+        [child.column, child.row][self.axis] < self.end_node
+    }
+
+    /// What the deviation of this part by chance is to be multiplied with to be that of a half of all texels.
+    pub fn by_chance(&self) -> f64 {
+        (self.share / (1.0 - self.share)).sqrt()
+    }
+}
+
 /// What a footprint does with a node.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Treatment {
@@ -96,6 +125,8 @@ pub enum Treatment {
 pub struct Scale {
     /// Side in texels up to which a cut node is taken as a whole.
     pub small: f64,
+    /// Relative error of the distribution that this costs.
+    pub error: f64,
     /// Level whose nodes are taken apart into texels.
     pub leaf: usize,
 }
@@ -208,16 +239,16 @@ impl Tree {
         self.map.0.div_ceil(self.side(level))
     }
 
-    /// Side in texels up to which a node is small against the footprint; `deviations`: of the parts of each level's nodes;
-    /// `error`: for a side, per deviation.
-    pub fn small_side(&self, error: impl Fn(f64) -> f64, deviations: &[f64]) -> f64 {
-        let is_small = |&(side, deviation): &(f64, f64)| error(side) * deviation <= TOLERANCE;
+    /// Side in texels up to which a node is small against the footprint, and the relative error that such nodes cost;
+    /// `deviations`: of the parts of each level's nodes; `error`: for a side, per deviation.
+    pub fn small_side(&self, error: impl Fn(f64) -> f64, deviations: &[f64]) -> (f64, f64) {
         let sides = (0..self.levels).map(|level| f64::from(self.side(level)));
         sides
-            .zip(deviations.iter().copied())
-            .take_while(is_small)
+            .zip(deviations)
+            .map(|(side, deviation)| (side, error(side) * deviation))
+            .take_while(|&(_, error)| error <= TOLERANCE)
             .last()
-            .map_or(0.0, |(side, _)| side)
+            .unwrap_or((0.0, 0.0))
     }
 
     /// Number of nodes of a level.
@@ -266,6 +297,22 @@ impl Tree {
                 column: column + dx,
             })
             .filter(move |child| child.column * side < map.0 && child.row * side < map.1)
+    }
+
+    /// The left and the upper half of a node, which is not a leaf: what the quarters there hold. `None`: all of the node.
+    pub fn halves(&self, node: &Node) -> [Option<Half>; 2] {
+        let side = self.side(node.level - 1);
+        let Rect { low, high } = self.rect(node);
+        let axes = [(low.0, high.0, node.column), (low.1, high.1, node.row)];
+        [0, 1].map(|axis| {
+            let (low, high, index) = axes[axis];
+            (low + side < high).then(|| Half {
+                axis,
+                end: low + side,
+                end_node: 2 * index + 1,
+                share: f64::from(side) / f64::from(high - low),
+            })
+        })
     }
 
     /// The node of a level that holds a texel.

@@ -12,6 +12,7 @@ use super::grid::Grid;
 use super::lanes::{compress, eight, mask, places};
 use crate::flakes::{FlakeModel, Normalization};
 use crate::half_vector::DirectionPair;
+use crate::methods::Reflection;
 use crate::microfacet::Distribution;
 
 /// `tan^2 / alpha^2` at which a Beckmann lobe ends; outside lies `exp(-R)` of it.
@@ -368,10 +369,13 @@ impl Sums {
         self.lobe.reach()
     }
 
-    /// Value and density.
-    pub fn totals(&mut self) -> (f32, f32) {
+    /// Value and density, times `scale`.
+    pub fn totals(&mut self, scale: f32) -> Reflection {
         self.flush();
-        (self.value.reduce_add(), self.density.reduce_add())
+        Reflection {
+            value: self.value.reduce_add() * scale,
+            density: self.density.reduce_add() * scale,
+        }
     }
 }
 

@@ -33,8 +33,13 @@
 //! **Exactness** Quantisation is at most about a twentieth of a lobe's standard deviation (for alpha >= 0.002; below, where
 //! 32 bits do not suffice, a step grows to 3e-5 of the map's range), which is up to 2 % of relative L1 error for a single lobe, less for
 //! several. Counts and blurred borders cost up to 2.3 % for footprints of more than a hundred texels' width on the maps of the
-//! scenes. Sampling, density and evaluation are exact partners: lobes are truncated for all three, and
-//! `sample` treats a texel as the cover of the footprint does.
+//! scenes. Lobes are truncated for sampling, density and evaluation alike, and `sample` treats a texel as the cover of the footprint
+//! does: it has exactly the density.
+//!
+//! That error is one of the whole distribution, of which most may lie in one direction: of a map of flakes in the base coat, while
+//! glints are elsewhere, where few texels reflect and a blurred border was up to 90 % off. So where the density tells that
+//! the error of the *value* would be above [`LOCAL_TOLERANCE`], the value is summed over the texels, up to [`MOST_SUMMED`] of
+//! them: some are in reach, and the others cost 0.1 ns each. The density stays that of the cover, as `sample` needs it.
 //!
 //! **Bounds** A footprint of up to 16 x 16 texels takes half a microsecond to one, at low roughness, `sample` the same, and so does one that
 //! covers the map evenly, where there are counts. In between, evaluation grows with the number of texels, by 0.15 ns each, and with that of
@@ -46,8 +51,8 @@
 //!   texels are tested. (A former version sorted the texels by direction, in blocks, and read the few cells around the half vector: 2 to
 //!   20 microseconds there. To find the one at a given place then took 4 microseconds, a chain of cache misses along the
 //!   inverse of the sort, for every sample of every footprint. Both orders together take the memory of the published structure.)
-//! * footprints of several periods of a large map at a roughness so low that only the root has counts: they do not count as even
-//!   before they are very large, as nothing tells how much parts of the map deviate, and milliseconds pass.
+//! * footprints of one to three periods of a large map at a roughness so low that only the root has counts, which is not small
+//!   against them yet: 0.4 to 1.5 milliseconds.
 //!
 //! **Gaussian footprints** ([`CompactBinMap::with_filter`], [`crate::footprint_filter`]) go the same ways. No two texels weigh
 //! the same, so that single texels are weighted one by one where they are near the half vector, eight at a time ([`border`]),
@@ -83,7 +88,7 @@ use wide::f32x8;
 
 use super::{MAX_RANGES, Method, RangeMeans, Reflection, mean_over};
 use crate::flakes::FlakeModel;
-use crate::footprint::Footprint;
+use crate::footprint::{Footprint, Parallelogram};
 use crate::footprint_filter::{FilteredFootprint, FilteredPart, FootprintFilter, Window};
 use crate::half_vector::DirectionPair;
 use crate::hash::mix;
@@ -107,6 +112,10 @@ const QUANTUM: f64 = 0.055;
 /// A footprint that touches fewer texels is summed over them.
 const DIRECT: f64 = 6500.0;
 
+/// Relative error of the value at single half vectors from which on texels are summed instead, up to so many of them.
+const LOCAL_TOLERANCE: f64 = 0.1;
+const MOST_SUMMED: f64 = 1.2e6;
+
 /// Side of the smallest square of texels with counts, as a power of two.
 const LEAF_BITS: u32 = 4;
 
@@ -125,6 +134,15 @@ pub struct CompactBinMap {
     finest: usize,
     /// Relative deviation of the parts of each level's nodes.
     deviations: Vec<f64>,
+    /// Of the map's half vectors, per solid angle: its mean over the map's own normals.
+    mean_density: f64,
+}
+
+/// What of a [`Reflection`] is asked for.
+#[derive(Clone, Copy, PartialEq)]
+enum Wanted {
+    Value,
+    Density,
 }
 
 impl CompactBinMap {
@@ -173,7 +191,8 @@ impl CompactBinMap {
         let finest = (0..tree.levels()).find(|&level| counts.has(level));
         Self {
             finest: finest.unwrap_or(tree.levels() - 1),
-            deviations: counts.deviations(&tree),
+            deviations: counts.deviations(&tree, |texel| texels.normal(texel)),
+            mean_density: counts.mean_density(&tree),
             map,
             model,
             filter: FootprintFilter::Box,
@@ -255,7 +274,7 @@ impl CompactBinMap {
     }
 
     fn scale(&self, footprint: &Footprint, filtered: &FilteredFootprint) -> Scale {
-        let small = match (self.filter, filtered.texel_in_deviations()) {
+        let (small, error) = match (self.filter, filtered.texel_in_deviations()) {
             (FootprintFilter::Box, _) => self
                 .tree
                 .small_side(cover::error_of_box(footprint), &self.deviations),
@@ -263,12 +282,21 @@ impl CompactBinMap {
                 .tree
                 .small_side(cover::error_of_gaussian(edges), &self.deviations),
             // All texels weigh the same.
-            (_, None) => f64::INFINITY,
+            (_, None) => (f64::INFINITY, 0.0),
         };
         Scale {
             small,
+            error,
             leaf: self.finest,
         }
+    }
+
+    /// Whether the value at a half vector of this density is to be summed over the texels: the error of a cover is that of
+    /// the mean half vector, and where fewer texels reflect it is greater, as by chance.
+    fn is_too_rough(&self, filtered: &FilteredFootprint, scale: Scale, density: f32) -> bool {
+        let least = self.mean_density * (scale.error / LOCAL_TOLERANCE).powi(2);
+        let is_affordable = |region: &Parallelogram| region.texel_count() <= MOST_SUMMED;
+        density > 0.0 && f64::from(density) < least && filtered.region().is_some_and(is_affordable)
     }
 
     /// A footprint so large that a whole period of the map is small against it covers the map evenly.
@@ -303,25 +331,32 @@ impl CompactBinMap {
     }
 
     /// Value and density over a footprint.
-    fn query(&self, footprint: &Footprint, query: Query) -> (f32, f32) {
-        let mut sums = Sums::new(query, self.lobe, *self.texels.grid());
+    fn query(&self, footprint: &Footprint, query: Query, wanted: Wanted) -> Reflection {
+        let new = || Sums::new(query, self.lobe, *self.texels.grid());
+        let mut sums = new();
         if footprint.region().is_none() {
             let [x, y] = self.texels.cell(footprint.texel());
             sums.add_alike(1, f32x8::splat(x as f32), f32x8::splat(y as f32), 1.0);
-            return sums.totals();
+            return sums.totals(1.0);
         }
         let filtered = self.filter.over(footprint);
+        let norm = (1.0 / self.total_weight(footprint)) as f32;
         if self.is_direct(&filtered) {
             self.add_texels(footprint, &filtered, &mut sums);
-        } else {
-            self.add_cover(footprint, &filtered, &mut sums);
+            return sums.totals(norm);
         }
-        let scale = (1.0 / self.total_weight(footprint)) as f32;
-        let (value, density) = sums.totals();
-        (value * scale, density * scale)
+        let scale = self.scale(footprint, &filtered);
+        self.add_cover(footprint, &filtered, scale, &mut sums);
+        let mut found = sums.totals(norm);
+        if wanted == Wanted::Value && self.is_too_rough(&filtered, scale, found.density) {
+            let mut sums = new();
+            self.add_texels(footprint, &filtered, &mut sums);
+            found.value = sums.totals(norm).value;
+        }
+        found
     }
 
-    /// Adds a small footprint's texels.
+    /// Adds a footprint's texels.
     fn add_texels(&self, footprint: &Footprint, filtered: &FilteredFootprint, sums: &mut Sums) {
         let everything = Rect {
             low: (0, 0),
@@ -342,8 +377,7 @@ impl CompactBinMap {
     }
 
     /// Adds what covers a large footprint.
-    fn add_cover(&self, footprint: &Footprint, filtered: &FilteredFootprint, sums: &mut Sums) {
-        let scale = self.scale(footprint, filtered);
+    fn add_cover(&self, footprint: &Footprint, filtered: &FilteredFootprint, scale: Scale, sums: &mut Sums) {
         if self.is_everywhere(scale) {
             let even = self.total_weight(footprint) / self.texel_count();
             let mut covered = Covered::new(self, &[], sums);
@@ -486,16 +520,18 @@ impl<'a> Covered<'a> {
 
 impl Method for CompactBinMap {
     fn evaluate(&self, footprint: &Footprint, pair: &DirectionPair) -> Reflection {
-        let (value, density) = self.query(footprint, Query::reflection(&self.model, &self.lobe, pair));
-        Reflection { value, density }
+        let query = Query::reflection(&self.model, &self.lobe, pair);
+        self.query(footprint, query, Wanted::Value)
     }
 
     fn density(&self, footprint: &Footprint, h: Vec3) -> f32 {
-        self.query(footprint, Query::distribution(&self.model, h)).1
+        let query = Query::distribution(&self.model, h);
+        self.query(footprint, query, Wanted::Density).density
     }
 
     fn ndf(&self, footprint: &Footprint, h: Vec3) -> f32 {
-        self.query(footprint, Query::distribution(&self.model, h)).0
+        let query = Query::distribution(&self.model, h);
+        self.query(footprint, query, Wanted::Value).value
     }
 
     fn sample(&self, footprint: &Footprint, u: [f32; 4]) -> Option<Vec3> {

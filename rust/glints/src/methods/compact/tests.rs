@@ -1,3 +1,4 @@
+use super::counts::LARGEST_DEVIATION;
 use super::*;
 use crate::flakes::Normalization;
 use crate::methods::direct::Direct;
@@ -118,6 +119,8 @@ fn strays_are_added_where_nodes_are_counted() {
     let model = model(0.02);
     let direct = Direct::new(map.clone(), model);
     let mut compact = CompactBinMap::new(&map, model);
+    // Covers tell the value everywhere.
+    compact.mean_density = 0.0;
     let strays: Vec<Vec3> = compact
         .strays
         .texels()
@@ -149,4 +152,79 @@ fn strays_are_added_where_nodes_are_counted() {
     compact.strays = Strays::none();
     let twin = error(&compact);
     assert!(twin > 0.3, "{twin}");
+}
+
+#[test]
+fn glints_beside_a_bright_coat_are_exact() {
+    // Fifty of 51 texels lie almost flat; the others, in flakes of 4 x 4 texels, point anywhere.
+    const SIDE: u32 = 1024;
+    let (coat, flakes) = (
+        random_map(SIDE, SIDE, 0.004, 3),
+        random_map(SIDE / 4, SIDE / 4, 0.3, 8),
+    );
+    let texels = (0..SIDE).flat_map(|row| (0..SIDE).map(move |column| (column, row)));
+    let normals: Vec<Vec3> = texels
+        .map(|(column, row)| {
+            let flake = row / 4 * (SIDE / 4) + column / 4;
+            if flake % 51 == 0 {
+                flakes.normals()[flake as usize]
+            } else {
+                coat.normals()[(row * SIDE + column) as usize]
+            }
+        })
+        .collect();
+    let map = NormalMap::from_normals("coat and flakes", SIDE, SIDE, &normals).unwrap();
+    let model = model(0.01);
+    let direct = Direct::new(map.clone(), model);
+    let mut compact = CompactBinMap::new(&map, model);
+    let edge = glam::DVec2::from_angle(0.4) * 600.0;
+    let footprint = Footprint::in_texels(SIDE, SIDE, glam::DVec2::new(400.0, 470.0), edge, edge.perp());
+    // Half vectors far from the coat's.
+    let error = |compact: &CompactBinMap| {
+        let (mut difference, mut sum) = (0.0, 0.0);
+        for k in 0..100 {
+            let turn = Vec2::from_angle(2.4 * k as f32);
+            let h = ((0.08 + 0.001 * k as f32) * turn).extend(1.0).normalize();
+            let expected = direct.ndf(&footprint, h);
+            difference += (compact.ndf(&footprint, h) - expected).abs();
+            sum += expected;
+        }
+        difference / sum
+    };
+    let found = error(&compact);
+    assert!(found < 0.04, "{found}");
+    // The broken twin: the cover's value everywhere.
+    compact.mean_density = 0.0;
+    let twin = error(&compact);
+    assert!(twin > 0.1, "{twin}");
+}
+
+#[test]
+fn parts_of_a_map_deviate_by_chance_or_by_streaks() {
+    // A long map, of whose root there are left and right halves only.
+    let roots = |map: &NormalMap, alpha: f32| {
+        let compact = CompactBinMap::new(map, model(alpha));
+        let known: Vec<f64> = compact.deviations.clone();
+        (known, compact)
+    };
+    let (even, compact) = roots(&random_map(512, 256, 0.5, 2), 0.05);
+    let last = *even.last().unwrap();
+    assert!(last > 0.0 && last < 0.2, "{even:?}");
+    // What some texels tell is about what all counts tell.
+    let sparse = compact
+        .counts
+        .deviation_of_root(&compact.tree, |texel| compact.texels.normal(texel));
+    let sparse = sparse.unwrap();
+    assert!(sparse > 0.6 * last && sparse < 1.7 * last, "{sparse} of {last}");
+    let rows = random_map(1, 256, 0.5, 2);
+    let streaks: Vec<Vec3> = (0..256 * 256).map(|k| rows.normals()[k / 256]).collect();
+    let (streaks, compact) = roots(
+        &NormalMap::from_normals("streaks", 256, 256, &streaks).unwrap(),
+        0.05,
+    );
+    assert_eq!(streaks.last(), Some(&LARGEST_DEVIATION), "{streaks:?}");
+    let sparse = compact
+        .counts
+        .deviation_of_root(&compact.tree, |texel| compact.texels.normal(texel));
+    assert!(sparse.unwrap() > 3.0 * last, "{sparse:?}");
 }
