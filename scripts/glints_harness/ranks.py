@@ -41,7 +41,7 @@ STRIDE = 32
 RESOLUTION = 256
 """Pixels a side of an image, the default of `glints_tensor`."""
 
-PICTURE_SIDE, PICTURE_SPP = 256, 8
+PICTURE_SIDE, PICTURE_SPP = 256, 2
 """Pixels a side of the pictures, and the samples per pixel of each of two independent renderings."""
 
 TIMED_SPP = 16

@@ -3,6 +3,7 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use rayon::prelude::*;
+use wide::f64x4;
 
 use super::cp::{self, Tensor};
 use super::images::{Group, Images, Members, PADDING, Parts};
@@ -180,7 +181,8 @@ fn level_differences(geometry: &Geometry, images: &[f32]) -> Vec<f64> {
                 for column in 0..x.kept {
                     let near = |node: u32, axis: usize| {
                         let position = f64::from(node) * fine.axes[axis].spacing();
-                        coarse.axes[axis].neighbours(position)
+                        let nodes = coarse.axes[axis].neighbours(f64x4::splat(position));
+                        nodes.map(|(nodes, weights)| (nodes[0], weights[0]))
                     };
                     let mut expected = [0.0; PIXELS];
                     for (r, wy) in near(row, 1) {

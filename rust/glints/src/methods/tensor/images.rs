@@ -535,11 +535,12 @@ impl Images {
             let (index, mass) = chosen?;
             let group = &self.group(index);
             self.reconstruct(group, rank_of(self.mask(index), local), &mut pixels);
-            let sum: f32 = pixels.iter().sum();
+            let rows = row_sums(&pixels);
+            let sum: f32 = rows.iter().sum();
             let z = mix(u64::from(u[1].to_bits()) << 32 | u64::from(u[2].to_bits()) ^ (draw << 16));
             let random = |bits: u64| (bits & 0xff_ffff) as f32 / 16_777_216.0;
             if random(z) * f32::from(mass) * unit < sum {
-                return Some(self.point(u32::from(group.block), &pixels, u[1], u[2]));
+                return Some(self.point(u32::from(group.block), &pixels, &rows, [u[1], u[2]]));
             }
             uniform = random(z >> 32);
         }
@@ -547,9 +548,8 @@ impl Images {
     }
 
     /// A pixel of a block by its value, and a point of its tent.
-    fn point(&self, block: u32, pixels: &[f32; PIXELS], u: f32, v: f32) -> Vec2 {
-        let rows: [f32; BLOCK] = std::array::from_fn(|i| pixels[i * BLOCK..][..BLOCK].iter().sum());
-        let (row, u) = choose(&rows, u);
+    fn point(&self, block: u32, pixels: &[f32; PIXELS], rows: &[f32; BLOCK], [u, v]: [f32; 2]) -> Vec2 {
+        let (row, u) = choose(rows, u);
         let (column, v) = choose(&pixels[row * BLOCK..][..BLOCK], v);
         let place = Vec2::new(column as f32 + tent(v), row as f32 + tent(u));
         self.geometry.corner(block) + (place + 0.5) * self.geometry.pixel()
@@ -620,7 +620,7 @@ impl Images {
                 .filter(|&(local, _)| has(self.mask(index), local));
             for (row, (_, &image)) in present.enumerate() {
                 self.reconstruct(&group, row, &mut pixels);
-                sums[image as usize].push(pixels.iter().sum::<f32>());
+                sums[image as usize].push(row_sums(&pixels).iter().sum::<f32>());
             }
         }
         let totals: Vec<f32> = sums
@@ -635,6 +635,18 @@ impl Images {
         self.parts.masses = masses.into();
         self.parts.totals = totals.into();
     }
+}
+
+/// The sum of each row of a block.
+fn row_sums(pixels: &[f32; PIXELS]) -> [f32; BLOCK] {
+    let half = |first: usize| {
+        sums(std::array::from_fn(|row| {
+            let row = &pixels[(first + row) * BLOCK..][..BLOCK];
+            eight(row, 0) + eight(row, 8)
+        }))
+    };
+    let (upper, lower) = (half(0).to_array(), half(8).to_array());
+    std::array::from_fn(|row| if row < 8 { upper[row] } else { lower[row - 8] })
 }
 
 /// A block's share of its image, rounded up.
@@ -733,6 +745,11 @@ fn product<const C: usize>(a: &Components<C>, b: &Components<C>) -> f32x8 {
         sum = a[c].mul_add(b[c], sum);
     }
     sum
+}
+
+#[inline]
+fn eight(values: &[f32], first: usize) -> f32x8 {
+    f32x8::from(std::array::from_fn(|k| values[first + k]))
 }
 
 /// The sum of each vector.

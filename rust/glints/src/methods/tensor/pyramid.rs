@@ -17,6 +17,7 @@
 //! takes 1 KB for each node. Nothing ever holds the whole pyramid.
 
 use glam::Vec2;
+use wide::f64x4;
 
 use super::lobe::{Lobes, Stamp};
 use super::{BLOCK, PIXELS, REGIONS};
@@ -55,18 +56,23 @@ impl Axis {
         self.dense / self.kept
     }
 
-    /// The kept nodes on both sides of a position in texels, with the weights of linear interpolation.
-    pub fn neighbours(&self, position: f64) -> [(u32, f64); 2] {
-        let p = position / self.spacing();
+    /// The kept nodes on both sides of four positions in texels, with the weights of linear interpolation.
+    pub fn neighbours(&self, positions: f64x4) -> [([u32; 4], [f64; 4]); 2] {
+        if self.kept == 1 {
+            return [([0; 4], [1.0; 4]), ([0; 4], [0.0; 4])];
+        }
+        let kept = f64::from(self.kept);
+        let p = positions * (kept / f64::from(self.size));
         let first = p.floor();
         let fraction = p - first;
-        if self.kept == 1 {
-            return [(0, 1.0), (0, 0.0)];
-        }
         // Remainders of floating-point numbers are slow, and these are asked for in every query.
-        let kept = f64::from(self.kept);
-        let node = |k: f64| ((k - (k * (1.0 / kept)).floor() * kept).max(0.0) as u32).min(self.kept - 1);
-        [(node(first), 1.0 - fraction), (node(first + 1.0), fraction)]
+        let first = (first - (first * (1.0 / kept)).floor() * kept).to_array();
+        let first = first.map(|k| (k.max(0.0) as u32).min(self.kept - 1));
+        let second = first.map(|k| if k + 1 == self.kept { 0 } else { k + 1 });
+        [
+            (first, (1.0 - fraction).to_array()),
+            (second, fraction.to_array()),
+        ]
     }
 
     /// Gaussian weights of `count` evenly spaced points, the first at `offset` texels, for every dense node, each node's sum

@@ -15,6 +15,7 @@
 
 use arrayvec::ArrayVec;
 use glam::DVec2;
+use wide::f64x4;
 
 use super::images::Blend;
 use super::pyramid::{Geometry, Level};
@@ -53,21 +54,29 @@ pub fn select(geometry: &Geometry, footprint: &Footprint, deviation: f64) -> Sel
     selection
 }
 
-/// The nodes about a position with their weights, times `share`. Those of one position are all different; other positions' may be
-/// among the images already, if these are `shared`.
+/// The nodes about the first `count` of four positions with their weights, times `share`. Those of one position are all different.
 #[inline]
-fn add_nodes(level: &Level, position: DVec2, share: f64, shared: bool, images: &mut Blend) {
-    let columns = level.axes[0].neighbours(position.x);
-    for (row, y) in level.axes[1].neighbours(position.y) {
-        for (column, x) in columns {
-            let weight = (share * x * y) as f32;
-            if weight <= 0.0 {
-                continue;
-            }
-            let image = level.image(column, row);
-            match images.iter_mut().find(|(i, _)| shared && *i == image) {
-                Some((_, sum)) => *sum += weight,
-                None => images.push((image, weight)),
+fn add_nodes(level: &Level, positions: [f64x4; 2], count: usize, share: f64, images: &mut Blend) {
+    if level.images() == 1 {
+        images.push((level.image(0, 0), (count as f64 * share) as f32));
+        return;
+    }
+    let [columns, rows] = [0, 1].map(|axis| level.axes[axis].neighbours(positions[axis]));
+    // Of this level; none is another's.
+    let start = images.len();
+    for tap in 0..count {
+        for (row, y) in &rows {
+            for (column, x) in &columns {
+                let weight = (share * x[tap] * y[tap]) as f32;
+                if weight <= 0.0 {
+                    continue;
+                }
+                let image = level.image(column[tap], row[tap]);
+                let known = if tap == 0 { &mut [] } else { &mut images[start..] };
+                match known.iter_mut().find(|(i, _)| *i == image) {
+                    Some((_, sum)) => *sum += weight,
+                    None => images.push((image, weight)),
+                }
             }
         }
     }
@@ -86,14 +95,15 @@ impl Taps {
         let last = (geometry.levels.len() - 1) as f64;
         let position = (self.sigma / effective(geometry)).log2().clamp(0.0, last);
         let (level, fraction) = (position.floor(), position - position.floor());
-        let weight = 1.0 / self.offsets.len() as f64;
-        let shared = self.offsets.len() > 1;
+        let count = self.offsets.len();
+        let weight = 1.0 / count as f64;
+        let offset = |tap: usize| self.offsets.get(tap).copied().unwrap_or_default();
+        let offsets: [DVec2; 4] = std::array::from_fn(offset);
+        let positions = [0, 1].map(|axis| f64x4::from(offsets.map(|offset| center[axis] + offset[axis])));
         for (index, share) in [(level, 1.0 - fraction), (level + 1.0, fraction)] {
             if share > 0.0 {
                 let level = &geometry.levels[index as usize];
-                for offset in &self.offsets {
-                    add_nodes(level, center + *offset, weight * share, shared, images);
-                }
+                add_nodes(level, positions, count, weight * share, images);
             }
         }
     }
@@ -101,7 +111,7 @@ impl Taps {
     fn new(gaussian: &GaussianFootprint) -> Self {
         let q = gaussian.covariance(0.0);
         let (mean, difference) = (0.5 * (q.xx + q.yy), 0.5 * (q.xx - q.yy));
-        let root = difference.hypot(q.xy);
+        let root = (difference * difference + q.xy * q.xy).sqrt();
         let (major, minor) = (mean + root, (mean - root).max(0.0));
         let variance = minor.max(major / LARGEST_RATIO2);
         if variance <= 0.0 {
