@@ -463,7 +463,8 @@ def test_benchmark_records_and_targets():
     assert goal("ibm/eval/worst", 3100.0, "ibm_paper", 1e6, side=2048, footprint=256.0) == ("≤ 3 µs", False)
     assert goal("ibm_paper/eval/worst", 3100.0, "ibm", 1e6, side=2048) is None
     frame = {"method": "glints_ibm", "resolution": 800}
-    assert goal("frame", 3.0, "normalmap x1", 2.0, **frame) == ("≤ 2×", True)
+    assert goal("frame", 2.5, "normalmap x1", 2.0, **frame) == ("≤ 1.3×", True)
+    assert goal("frame", 3.0, "normalmap x32", 2.0, **frame) == ("≤ 1.3×", False)
     assert goal("frame", 3.0, "roughconductor", 2.0, **frame) is None
 
 

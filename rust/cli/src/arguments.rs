@@ -136,9 +136,9 @@ pub struct TensorOptions {
     #[arg(long, value_name = "PIXELS", default_value_t = 256)]
     resolution: u32,
 
-    /// Relative error of a decomposition at which the solver stops
-    #[arg(long, value_name = "ERROR", default_value_t = 1e-4)]
-    tolerance: f64,
+    /// Relative error of a decomposition at which the solver stops [default: 0.001, with --published 0.0001]
+    #[arg(long, value_name = "ERROR")]
+    tolerance: Option<f64>,
 
     /// Relative L1 difference of neighbouring levels below which the coarser one is left out
     #[arg(long, value_name = "DIFFERENCE", default_value_t = 0.02)]
@@ -162,7 +162,7 @@ impl TensorOptions {
             resolution: self.resolution,
             agreement: self.agreement,
             solver: tensor::cp::Options {
-                tolerance: self.tolerance,
+                tolerance: self.tolerance.unwrap_or(own.solver.tolerance),
                 ..own.solver
             },
             ..own

@@ -50,19 +50,20 @@ impl<T> Default for Array<T> {
     }
 }
 
-/// Asks for the cache lines of a range of values.
+/// Asks for the cache lines of a range of values, which may reach beyond the last one.
 #[inline]
 pub fn prefetch<T>(values: &[T], range: Range<usize>) {
     const LINE: usize = 64;
-    for at in range.step_by((LINE / size_of::<T>()).max(1)) {
-        let Some(value) = values.get(at) else { return };
+    let bytes = range.start * size_of::<T>()..range.end * size_of::<T>();
+    for at in bytes.step_by(LINE) {
+        let address = values.as_ptr().cast::<u8>().wrapping_add(at);
         #[cfg(target_arch = "x86_64")]
-        // SAFETY: a prefetch reads nothing and cannot fault; the address is that of a value.
+        // SAFETY: a prefetch reads nothing and cannot fault, whatever the address.
         unsafe {
             use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-            _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast());
+            _mm_prefetch::<_MM_HINT_T0>(address.cast());
         }
         #[cfg(not(target_arch = "x86_64"))]
-        let _ = value;
+        let _ = address;
     }
 }

@@ -309,7 +309,7 @@ impl Parallelogram {
     }
 
     /// Half extents of the axis-aligned bounding box.
-    fn half_extents(&self) -> DVec2 {
+    pub(crate) fn half_extents(&self) -> DVec2 {
         0.5 * (self.edges[0].abs() + self.edges[1].abs())
     }
 
@@ -384,18 +384,23 @@ impl Parallelogram {
         polygon.area()
     }
 
+    /// Rows of height `height` that the parallelogram touches, of those in `rows`.
+    pub fn rows(&self, height: f64, rows: Range<i64>) -> Range<i64> {
+        let e = self.half_extents().y;
+        let first = ((self.center.y - e) / height).floor().max(rows.start as f64) as i64;
+        let end = ((self.center.y + e) / height).ceil().min(rows.end as f64) as i64;
+        first..end
+    }
+
     /// Rows of the grid with cells of size `cell` that the parallelogram touches, in increasing order.
     pub fn spans(&self, cell: DVec2) -> impl Iterator<Item = Span> + use<> {
         self.spans_of_rows(cell, i64::MIN..i64::MAX)
     }
 
     /// Those of [`Parallelogram::spans`] whose rows are in `rows`.
-    pub fn spans_of_rows(&self, cell: DVec2, rows: Range<i64>) -> impl Iterator<Item = Span> + use<> {
-        let e = self.half_extents();
-        let first = ((self.center.y - e.y) / cell.y).floor().max(rows.start as f64) as i64;
-        let last = ((self.center.y + e.y) / cell.y).ceil().min(rows.end as f64) as i64;
+    fn spans_of_rows(&self, cell: DVec2, rows: Range<i64>) -> impl Iterator<Item = Span> + use<> {
         let spans = Rows::new(self, cell);
-        (first..last).map(move |row| spans.span(row))
+        self.rows(cell.y, rows).map(move |row| spans.span(row))
     }
 
     /// [`Parallelogram::spans`] over texels, cut to the map's `[0, width) x [0, height)`.

@@ -26,6 +26,8 @@
 //! **Bounds** Positions count from the footprint's middle, in single precision: weights are within 1e-4 of the exact area,
 //! and of a Gaussian within 1e-5 of its weight.
 
+use std::ops::Range;
+
 use glam::DVec2;
 use wide::{CmpGe, CmpGt, CmpLe, CmpLt, f32x8, u32x8};
 
@@ -50,9 +52,18 @@ pub struct Border<'a> {
     origin: [f32; 2],
     offset: [f32; 2],
     slabs: [Slab; 2],
+    /// Of the footprint, along x.
+    half_extent: f32,
     is_thin: bool,
     /// `None`: all texels inside weigh one.
     gaussian: Option<Gaussian<'a>>,
+}
+
+/// The squares of a row of squares that a footprint may touch, and some of them that lie inside it.
+#[derive(Clone, Default)]
+pub struct Squares {
+    pub touched: Range<u32>,
+    pub inside: Range<u32>,
 }
 
 /// The weights of texels under a Gaussian.
@@ -148,9 +159,11 @@ struct Slab {
     short: f32,
     inv_long: f32,
     inv_product: f32,
-    /// In a row at y, texels touch the slab within `half_width` of `x = shift y`.
+    /// In a row at y, the slab is what lies within `half_width` of `x = shift y`.
     shift: f32,
     half_width: f32,
+    /// Half of how far texels along the row differ in s, as a length.
+    half_texel: f32,
 }
 
 impl Slab {
@@ -169,7 +182,8 @@ impl Slab {
         };
         Self {
             shift: (-gradient.y / gx) as f32,
-            half_width: ((0.5 + 0.5 * (long + short)) / gx.abs()) as f32,
+            half_width: (0.5 / gx.abs()) as f32,
+            half_texel: (0.5 * (long + short) / gx.abs()) as f32,
             gradient: gradient.as_vec2().to_array(),
             long: long as f32,
             short: short as f32,
@@ -320,6 +334,7 @@ impl<'a> Border<'a> {
             origin: origin.as_vec2().to_array(),
             offset: (origin + 0.5 - center).as_vec2().to_array(),
             slabs: gradients.map(Slab::new),
+            half_extent: region.half_extents().x as f32,
             is_thin: thickness[0].min(thickness[1]) < THIN,
             gaussian: window
                 .texel_in_deviations()
@@ -408,6 +423,46 @@ impl<'a> Border<'a> {
         areas
     }
 
+    /// The squares of `side` texels in eight rows of squares, of those in `columns`.
+    #[inline]
+    pub fn squares(&self, side: u32, row: u32, columns: &Range<u32>) -> [Squares; 8] {
+        let size = side as f32;
+        // Numbers count from the square that holds the footprint's middle: they stay small, and single precision tells them apart.
+        let origin = self.origin.map(|origin| (origin / size).floor());
+        let first = [0, 1].map(|axis| {
+            let corner = origin[axis] * size - self.origin[axis];
+            corner + 0.5 * (size - 1.0) + self.offset[axis]
+        });
+        let y = (LANES + (row as f32 - origin[1])).mul_add(f32x8::splat(size), f32x8::splat(first[1]));
+        let widest = f32x8::splat(self.half_extent + 0.5 * size + 0.01);
+        let (mut touched, mut inside) = ((-widest, widest), (-widest, widest));
+        for slab in &self.slabs {
+            let middle = y * slab.shift;
+            let half = f32x8::splat(slab.half_width);
+            let variation = f32x8::splat(slab.half_texel) * size;
+            let rounding = rounding(middle, half + variation);
+            let narrow = |(low, high): (f32x8, f32x8), reach: f32x8| {
+                (low.fast_max(middle - reach), high.fast_min(middle + reach))
+            };
+            touched = narrow(touched, half + variation + rounding);
+            inside = narrow(inside, half - variation - rounding);
+        }
+        let [start, end] = [columns.start, columns.end].map(|column| f32x8::splat(column as f32 - origin[0]));
+        let range = |(low, high): (f32x8, f32x8), start: f32x8, end: f32x8| {
+            let square = |x: f32x8| (x - first[0]) * (1.0 / size);
+            let low = square(low).ceil().fast_max(start).fast_min(end);
+            (low, (square(high).floor() + 1.0).fast_max(low).fast_min(end))
+        };
+        let touched = range(touched, start, end);
+        let inside = range(inside, touched.0, touched.1);
+        let column = |x: f32x8| (x + origin[0]).trunc_int().to_array();
+        let [a, b, c, d] = [touched.0, touched.1, inside.0, inside.1].map(column);
+        std::array::from_fn(|k| Squares {
+            touched: a[k] as u32..b[k] as u32,
+            inside: c[k] as u32..d[k] as u32,
+        })
+    }
+
     /// Bit `8 y + x`: the footprint may touch this one of the 8 x 8 texels from `(column, row)` on. It touches no other.
     #[inline]
     pub fn touched(&self, column: u32, row: u32) -> u64 {
@@ -415,9 +470,8 @@ impl<'a> Border<'a> {
         let (mut first, mut last) = (f32x8::splat(-1.0), f32x8::splat(8.0));
         for slab in &self.slabs {
             let middle = y * slab.shift - x;
-            let half = f32x8::splat(slab.half_width);
-            // Rounding grows with the numbers that are subtracted.
-            let reach = half + (0.01 + (middle.abs() + half) * 4e-6);
+            let reach = f32x8::splat(slab.half_width + slab.half_texel);
+            let reach = reach + rounding(middle, reach);
             first = first.fast_max(middle - reach);
             last = last.fast_min(middle + reach);
         }
@@ -433,6 +487,12 @@ impl<'a> Border<'a> {
             .rev()
             .fold(0, |mask, row| mask << 8 | u64::from(row & 0xff))
     }
+}
+
+/// What rounding may move the ends of an interval `middle +- half` by: it grows with the numbers that are subtracted.
+#[inline(always)]
+fn rounding(middle: f32x8, half: f32x8) -> f32x8 {
+    0.01 + (middle.abs() + half) * 4e-6
 }
 
 #[cfg(test)]
@@ -453,6 +513,43 @@ mod tests {
 
     proptest! {
         #[test]
+        fn squares_of_rows_are_those_of_the_footprint(
+            center in (0.0..4096.0_f64, 0.0..4096.0_f64),
+            length in 1.0..900.0_f64,
+            ratio in 0.001..1.0_f64,
+            turns in (0..9_u32, -1e-6..1e-6_f64, 0.0..6.3_f64, 0.01..3.1_f64),
+        ) {
+            // Some along the rows and columns, or nearly so.
+            let turn = if turns.0 < 5 { f64::from(turns.0) * std::f64::consts::FRAC_PI_2 + turns.1 } else { turns.2 };
+            let [a, b] = edges(length, ratio, (turn, turns.3));
+            let footprint = Footprint::in_texels(4096, 4096, center.into(), a, b);
+            let region = footprint.region().unwrap();
+            let filtered = FootprintFilter::Box.over(&footprint);
+            let Some(window) = filtered.single_window() else { return Ok(()) };
+            let border = Border::new(&window);
+            for span in region.spans(DVec2::splat(8.0)).filter(|span| (0..512).contains(&span.row)) {
+                let row = span.row as u32;
+                let Squares { touched, inside } = &border.squares(8, row / 8 * 8, &(0..512))[row as usize % 8];
+                prop_assert!(inside.is_empty() || touched.start <= inside.start && inside.end <= touched.end);
+                for column in (span.touched.0 - 2).max(0)..(span.touched.1 + 2).min(512) {
+                    let column = column as u32;
+                    let corner = 8.0 * DVec2::new(column.into(), row.into());
+                    let area = region.overlap(corner, corner + 8.0);
+                    prop_assert!(area < 1e-6 || touched.contains(&column), "{area} of {column} {row} outside");
+                    prop_assert!(area > 64.0 - 1e-6 || !inside.contains(&column), "{area} of {column} {row} inside");
+                    // Not much more than needed, unless an edge is along the rows, nearly, and rounding decides.
+                    if turns.0 < 5 {
+                        continue;
+                    }
+                    let is_near = (span.touched.0 - 1..span.touched.1 + 1).contains(&column.into());
+                    prop_assert!(is_near || !touched.contains(&column), "{column} {row} is far away");
+                    let is_deep = (span.inside.0 + 1..span.inside.1 - 1).contains(&column.into());
+                    prop_assert!(!is_deep || inside.contains(&column), "{column} {row} is deep inside");
+                }
+            }
+        }
+
+        #[test]
         fn weights_are_areas(
             center in (10.0..20.0_f64, 10.0..20.0_f64),
             length in 0.02..12.0_f64,
@@ -463,7 +560,8 @@ mod tests {
             let [a, b] = edges(length, ratio, angles);
             let footprint = Footprint::in_texels(40, 40, center.into(), a, b);
             let region = footprint.region().unwrap();
-            let window = FootprintFilter::Box.over(&footprint).single_window().unwrap();
+            let filtered = FootprintFilter::Box.over(&footprint);
+            let Some(window) = filtered.single_window() else { return Ok(()) };
             let border = Border::new(&window);
             let touched = border.touched(first.0, first.1);
             let (columns, rows) = (LANES + first.0 as f32, f32x8::splat(first.1 as f32));

@@ -23,7 +23,7 @@
 //!
 //! | elements | |
 //! |---|---|
-//! | u8 | [`super::tiles`]: upper bytes |
+//! | 128 u8 | [`super::tiles`]: upper bytes of a tile |
 //! | u32 | tiles: lower bits |
 //! | u8, u16 or u32 | for each level that has them, from the finest on: counts, with their padding |
 //! | u32 | strays: where the squares begin |
@@ -61,7 +61,7 @@ use crate::normal_map::{MIN_Z, NormalMap, SlopeCovariance};
 use crate::refinement::{MAX_REFINEMENT, Refinement};
 
 /// The version that is written, and the only one that is read.
-pub const VERSION: u32 = 5;
+pub const VERSION: u32 = 6;
 
 const KIND: Kind = Kind {
     magic: *b"\x89GLINTS\n",

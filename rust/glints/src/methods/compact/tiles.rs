@@ -15,11 +15,12 @@
 
 use std::ops::Range;
 
+use bytemuck::{Pod, Zeroable};
 use glam::{DVec2, Vec2, Vec3};
 use rayon::prelude::*;
 use wide::{CmpGt, f32x8, i8x32, u32x8};
 
-use super::border::{Border, Touched};
+use super::border::{Border, Squares, Touched};
 use super::cover::Rect;
 use super::grid::Grid;
 use super::lanes::{LANES, order, to_float, widened};
@@ -33,8 +34,14 @@ const SIDE: u32 = 8;
 /// Texels of a tile.
 const TEXELS: usize = 64;
 
-/// Upper bytes of a tile: those of x, then those of y.
-const UPPER: usize = 2 * TEXELS;
+/// The upper bytes of a tile, of x and of y: a cache line each.
+#[repr(C, align(64))]
+#[derive(Clone, Copy)]
+pub struct Upper([[u8; TEXELS]; 2]);
+
+// SAFETY: bytes without padding, of which any are valid.
+unsafe impl Zeroable for Upper {}
+unsafe impl Pod for Upper {}
 
 /// The numbers of lower bits of a texel, of x and y together, that a layout may have.
 const LOWER_BITS: [u32; 7] = [4, 6, 8, 10, 12, 14, 16];
@@ -48,7 +55,7 @@ pub struct Tiles {
     grid: Grid,
     /// k and l.
     lower_bits: [u32; 2],
-    upper: Array<u8>,
+    upper: Array<Upper>,
     lower: Array<u32>,
 }
 
@@ -110,11 +117,9 @@ impl Window {
 
     /// Half of the texels of a tile: not zero for those that are out of reach.
     #[inline(always)]
-    fn outside(&self, upper: &[u8; UPPER], half: usize) -> i8x32 {
+    fn outside(&self, upper: &Upper, half: usize) -> i8x32 {
         let beyond = |axis: usize| {
-            let bytes: [u8; 32] = upper[axis * TEXELS + 32 * half..][..32]
-                .try_into()
-                .expect("32 bytes");
+            let bytes: [u8; 32] = upper.0[axis][32 * half..][..32].try_into().expect("32 bytes");
             // Differences wrap: what is below the first is far ahead.
             (i8x32::new(bytemuck::cast(bytes)) - self.first[axis]).cmp_gt(self.extent[axis])
         };
@@ -123,13 +128,13 @@ impl Window {
 
     /// Whether any texel may be within reach.
     #[inline(always)]
-    fn finds(&self, upper: &[u8; UPPER]) -> bool {
+    fn finds(&self, upper: &Upper) -> bool {
         (self.outside(upper, 0) & self.outside(upper, 1)).move_mask() != -1
     }
 
     /// Bit `8 y + x`: the texel may be within reach.
     #[inline(always)]
-    fn find(&self, upper: &[u8; UPPER]) -> u64 {
+    fn find(&self, upper: &Upper) -> u64 {
         let [low, high] = [0, 1].map(|half| u64::from(self.outside(upper, half).move_mask() as u32));
         !(low | high << 32)
     }
@@ -176,14 +181,14 @@ impl Tiles {
         let size = (map.width(), map.height());
         let mut tiles = Self::from_parts(size, grid, Default::default());
         let (upper, lower) = tiles.lengths();
-        let (mut upper, mut lower) = (vec![0; upper], vec![0; lower]);
+        let (mut upper, mut lower) = (vec![Upper::zeroed(); upper], vec![0; lower]);
         let columns = tiles.size().0 as usize;
         let units = tiles.units_per_tile();
         let rows = upper
-            .par_chunks_mut(columns * UPPER)
+            .par_chunks_mut(columns)
             .zip(lower.par_chunks_mut(columns * units));
         rows.enumerate().for_each(|(row, (upper, lower))| {
-            let tile = upper.chunks_exact_mut(UPPER).zip(lower.chunks_exact_mut(units));
+            let tile = upper.iter_mut().zip(lower.chunks_exact_mut(units));
             for (column, (upper, lower)) in tile.enumerate() {
                 for k in 0..SIDE * SIDE {
                     let column = (column as u32 * SIDE + k % SIDE).min(size.0 - 1);
@@ -198,7 +203,7 @@ impl Tiles {
     }
 
     /// The same from arrays that exist; see [`Self::lengths`].
-    pub fn from_parts(map: (u32, u32), grid: Grid, (upper, lower): (Array<u8>, Array<u32>)) -> Self {
+    pub fn from_parts(map: (u32, u32), grid: Grid, (upper, lower): (Array<Upper>, Array<u32>)) -> Self {
         Self {
             map,
             grid,
@@ -213,11 +218,11 @@ impl Tiles {
         (self.map.0.div_ceil(SIDE), self.map.1.div_ceil(SIDE))
     }
 
-    /// Upper bytes and 32-bit units of lower bits of all tiles.
+    /// How many upper bytes of tiles and 32-bit units of lower bits there are.
     pub fn lengths(&self) -> (usize, usize) {
         let (columns, rows) = self.size();
         let tiles = columns as usize * rows as usize;
-        (tiles * UPPER, tiles * self.units_per_tile())
+        (tiles, tiles * self.units_per_tile())
     }
 
     /// Bits of a texel's lower part.
@@ -243,7 +248,7 @@ impl Tiles {
     }
 
     /// Upper bytes and lower bits.
-    pub fn parts(&self) -> (&Array<u8>, &Array<u32>) {
+    pub fn parts(&self) -> (&Array<Upper>, &Array<u32>) {
         (&self.upper, &self.lower)
     }
 
@@ -262,8 +267,8 @@ impl Tiles {
         }
         let [bits_x, bits_y] = self.lower_bits;
         [
-            u32::from(upper[k]) << bits_x | lower & ((1 << bits_x) - 1),
-            u32::from(upper[TEXELS + k]) << bits_y | lower >> bits_x & ((1 << bits_y) - 1),
+            u32::from(upper.0[0][k]) << bits_x | lower & ((1 << bits_x) - 1),
+            u32::from(upper.0[1][k]) << bits_y | lower >> bits_x & ((1 << bits_y) - 1),
         ]
     }
 
@@ -274,10 +279,10 @@ impl Tiles {
     }
 
     /// Writes a cell into a zeroed tile.
-    fn put(&self, upper: &mut [u8], tile: &mut [u32], k: usize, [x, y]: [u32; 2]) {
+    fn put(&self, upper: &mut Upper, tile: &mut [u32], k: usize, [x, y]: [u32; 2]) {
         let [bits_x, bits_y] = self.lower_bits;
-        upper[k] = (x >> bits_x) as u8;
-        upper[TEXELS + k] = (y >> bits_y) as u8;
+        upper.0[0][k] = (x >> bits_x) as u8;
+        upper.0[1][k] = (y >> bits_y) as u8;
         let lower = x & ((1 << bits_x) - 1) | (y & ((1 << bits_y) - 1)) << bits_x;
         for Part { unit, bits, shift } in parts(self.lower_width()) {
             let bit = k * bits as usize;
@@ -293,21 +298,23 @@ impl Tiles {
         };
         let mut batch = Batch::new(Weight::Inside(border));
         let (columns, rows) = tiles_of(rect);
-        let rows = rows.start.into()..rows.end.into();
+        let rows = border
+            .region
+            .rows(SIDE.into(), rows.start.into()..rows.end.into());
         let is_even = border.is_even();
-        for span in border.region.spans_of_rows(DVec2::splat(SIDE.into()), rows) {
-            let row = span.row as u32;
-            let clamp = |column: i64| column.clamp(columns.start.into(), columns.end.into()) as u32;
-            let inside = clamp(span.inside.0)..clamp(span.inside.1);
-            let touched = clamp(span.touched.0)..clamp(span.touched.1);
-            self.for_each_near(&window, row, touched, |column| {
-                let tile = Asked {
-                    column,
-                    row,
-                    inside: is_even && inside.contains(&column),
-                };
-                self.ask(tile, &mut batch, &window, sums);
-            });
+        for eight in rows.clone().step_by(8) {
+            let squares = border.squares(SIDE, eight as u32, &columns);
+            for (row, squares) in (eight..rows.end).zip(squares) {
+                let Squares { touched, inside } = squares;
+                self.for_each_near(&window, row as u32, touched, |column| {
+                    let tile = Asked {
+                        column,
+                        row: row as u32,
+                        inside: is_even && inside.contains(&column),
+                    };
+                    self.ask(tile, &mut batch, &window, sums);
+                });
+            }
         }
         self.read(&mut batch, &window, sums);
     }
@@ -335,15 +342,13 @@ impl Tiles {
     /// Calls `visit` with the columns of a row's tiles that may have a texel within reach.
     #[inline(always)]
     fn for_each_near(&self, window: &Window, row: u32, columns: Range<u32>, mut visit: impl FnMut(u32)) {
-        let all: &[u8] = &self.upper;
-        let place = |row: u32| self.index(columns.start, row) * UPPER;
-        let tiles = all[place(row)..].chunks_exact(UPPER);
+        let all: &[Upper] = &self.upper;
         // Those of a row come in one go; the first of the next row would be waited for.
-        let mut next = place(row + 1);
-        for (column, upper) in columns.clone().zip(tiles) {
-            prefetch(all, next..next + UPPER);
-            next += UPPER;
-            if window.finds(upper.try_into().expect("the upper bytes")) {
+        let next = self.index(columns.start, row + 1);
+        let tiles = all[self.index(columns.start, row)..].iter();
+        for ((column, upper), next) in columns.clone().zip(tiles).zip(next..) {
+            prefetch(all, next..next + 1);
+            if window.finds(upper) {
                 visit(column);
             }
         }
@@ -411,8 +416,8 @@ impl Tiles {
     #[inline(always)]
     fn cells(&self, column: u32, tile_row: u32, row: usize) -> (f32x8, f32x8) {
         let (upper, tile) = (self.upper(column, tile_row), self.lower(column, tile_row));
-        let eight = |at: usize| {
-            let bytes: &[u8; 8] = upper[at..at + 8].try_into().expect("eight bytes");
+        let eight = |axis: usize| {
+            let bytes: &[u8; 8] = upper.0[axis][8 * row..][..8].try_into().expect("eight bytes");
             widened(bytes)
         };
         let mut lower = u32x8::ZERO;
@@ -432,8 +437,8 @@ impl Tiles {
         }
         let [bits_x, bits_y] = self.lower_bits;
         let mask = |bits: u32| u32x8::splat((1 << bits) - 1);
-        let x = eight(8 * row) << bits_x | lower & mask(bits_x);
-        let y = eight(TEXELS + 8 * row) << bits_y | lower >> bits_x & mask(bits_y);
+        let x = eight(0) << bits_x | lower & mask(bits_x);
+        let y = eight(1) << bits_y | lower >> bits_x & mask(bits_y);
         (to_float(x), to_float(y))
     }
 
@@ -444,9 +449,8 @@ impl Tiles {
 
     /// The upper bytes of a tile.
     #[inline(always)]
-    fn upper(&self, column: u32, row: u32) -> &[u8; UPPER] {
-        let bytes = &self.upper[self.index(column, row) * UPPER..][..UPPER];
-        bytes.try_into().expect("the upper bytes")
+    fn upper(&self, column: u32, row: u32) -> &Upper {
+        &self.upper[self.index(column, row)]
     }
 
     /// The lower bits of a tile.

@@ -18,7 +18,7 @@
 //! | groups of blocks, decomposed ([`cp`]) and rounded ([`quantise`]) | [`build`] |
 //! | point queries, range queries, sampling | [`images`] |
 //! | footprints as blends of images | [`select`] |
-//! | files | [`file`] |
+//! | files | `file` |
 //!
 //! **Small footprints** are the exact method's, a [`CompactBinMap`] of the same map, over the parallelogram that has the
 //! Gaussian's covariance. Its share fades out linearly while the footprint grows from half to all of the finest level's size:

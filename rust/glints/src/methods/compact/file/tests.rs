@@ -162,11 +162,11 @@ fn refusals_say_why() {
     for (message, word) in [
         (
             refusal_of(&of_version(VERSION + 1)),
-            "version 6 of the format, this program reads version 5",
+            "version 7 of the format, this program reads version 6",
         ),
         (
             refusal_of(&old),
-            "version 3 of the format, this program reads version 5",
+            "version 3 of the format, this program reads version 6",
         ),
         (refusal_of(&damaged), "checksum"),
         (refusal_of(&bytes[..bytes.len() - 1]), "bytes instead of"),
@@ -323,13 +323,13 @@ fn sections_are_those_that_fields_ask_for() {
     let mut other = structure.sections();
     other[1] = Section::new(&[0_u64; 3]);
     let mut longer = structure.sections();
-    longer[0] = Section::new(&[0_u8; 3]);
+    longer[1] = Section::new(&[0_u32; 3]);
     for (sections, word) in [
         (without(0), "sections instead of"),
         (without(3), "sections instead of"),
         (more, "sections instead of"),
         (other, "section 1"),
-        (longer, "section 0 has 3 elements"),
+        (longer, "section 1 has 3 elements"),
     ] {
         KIND.write(&path, &fields, &sections).unwrap();
         let message = refusal(&path);
