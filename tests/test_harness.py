@@ -494,7 +494,8 @@ def test_images_of_a_precomputation_are_counted_by_level():
 
 @pytest.mark.skipif(shutil.which("cargo") is None, reason="needs cargo")
 def test_ranks_trade_storage_for_error(tmp_path, monkeypatch):
-    for name, small in {"PICTURE_SIDE": 64, "PICTURE_SPP": 1, "TIMED_SPP": 1}.items():
+    small_numbers = {"PICTURE_SIDE": 64, "PICTURE_SPP": 1, "TIMED_SPP": 1, "DEFAULT_RANK": 8, "FURTHER_TILINGS": (20,)}
+    for name, small in small_numbers.items():
         monkeypatch.setattr(ranks, name, small)
     render.prepare_thread()
     (scene,) = scenes.find_scenes(ROOT / "mitsuba_scenes", [ranks.SCENE], scene_assets(ROOT / ".cache"))
@@ -506,6 +507,8 @@ def test_ranks_trade_storage_for_error(tmp_path, monkeypatch):
     values = {(record["name"], record["params"]["rank"]): record["value"] for record in records}
     names = ("precompute", "storage", "ndf_error", "frame_error", "frame_eval_ratio", "frame_sample_ratio")
     assert set(values) == {(f"tensor/{name}", rank) for name in names for rank in (1, 8)}
+    timed = [record["params"] for record in records if record["name"] == "tensor/frame_eval_ratio"]
+    assert [(params["rank"], params["tiling"]) for params in timed] == [(1, ranks.TILING), (8, ranks.TILING), (8, 20)]
     assert all(math.isfinite(value) for value in values.values())
     assert all(value > 0 for (name, _), value in values.items() if name != "tensor/frame_error")
     assert values["tensor/ndf_error", 8] < values["tensor/ndf_error", 1] < 1

@@ -112,6 +112,9 @@ def made_ranks(folder):
                 records.append(
                     {"name": f"tensor/{name}", "value": value, "unit": "", "ratio": value / 4, "params": params}
                 )
+        # Times at a further tiling, which no plot over ranks shows.
+        further = {**params, "tiling": 1000}
+        records.append({"name": "tensor/frame_eval_ratio", "value": 99, "unit": "", "ratio": 99, "params": further})
         for rank in (2, 16, ranks.UNCOMPRESSED):
             file = folder / "pictures" / f"{label}-{rank}.exr"
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -360,6 +363,7 @@ def test_plots_and_pictures_of_ranks_come_from_the_last_benchmark(written):
     assert list(found) == list(rank_report.QUANTITIES)
     assert [item.label for item in found["precompute"].series] == ["isotropic", "flakes"]
     assert [(point.x, point.y) for point in found["precompute"].series[0].points] == [(2, 2), (16, 16)]
+    assert [(point.x, point.y) for point in found["frame_eval_ratio"].series[0].points] == [(2, 10), (16, 80)]
     # Storage is plotted as the share of what is not compressed.
     assert [(point.x, point.y) for point in found["storage"].series[1].points] == [(2, 1.0), (16, 8.0)]
     section = report_page.rank_section(results)

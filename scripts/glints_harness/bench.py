@@ -99,13 +99,10 @@ TARGETS = {
 
 TARGET_SIDE = 2048
 
-DEFAULT_RANK = 32
-"""Of `glints_tensor`: in eight bits, it takes what the paper's 16 take in sixteen."""
-
 TENSOR_TABLE = (
     # map, texels a side, rank; at most so many seconds on 2 cores, and bytes: half the paper's
     ("brushed", 2048, 16, 180, 7.6e6),
-    ("brushed", 2048, DEFAULT_RANK, 180, 7.6e6),
+    ("brushed", 2048, ranks.DEFAULT_RANK, 180, 7.6e6),
     ("brushed", 1024, 16, 60, 3.6e6),
     ("flakes", 2048, 32, 360, 53.5e6),
 )
@@ -123,10 +120,10 @@ def tensor_target(record):
                 return "≤ half", value <= size
     if name == "tensor/eval/growth":
         return "≤ 1.1", value <= 1.1
-    if name == "tensor/highlight_error" and (params["against"], params["rank"]) == ("compression", DEFAULT_RANK):
+    if name == "tensor/highlight_error" and (params["against"], params["rank"]) == ("compression", ranks.DEFAULT_RANK):
         return "≤ 3 %", value <= 0.03
     limits = {"tensor/frame_eval_ratio": 1.1, "tensor/frame_sample_ratio": 1.5}
-    if name in limits and params.get("rank") == DEFAULT_RANK:
+    if name in limits and params.get("rank") == ranks.DEFAULT_RANK:
         return f"≤ {limits[name]}", value <= limits[name]
     return None
 

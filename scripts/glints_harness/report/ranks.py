@@ -1,7 +1,7 @@
 """The report's plots and pictures of ranks of the tensor decomposition, from the last benchmark (see `..ranks`)."""
 
 from .. import images
-from ..ranks import UNCOMPRESSED
+from ..ranks import TILING, UNCOMPRESSED
 from . import plots
 from .tables import Column, table
 from .text import bytes_text, number, seconds_text
@@ -21,7 +21,7 @@ def rank_plots(ranks):
     """{quantity: `plots.Plot`}, a curve for each map; without a benchmark none."""
     found = {}
     for quantity, (field, axis, shown) in QUANTITIES.items() if ranks else ():
-        mine = [record for record in ranks.records if record["name"] == f"tensor/{quantity}"]
+        mine = [record for record in of_all_ranks(ranks) if record["name"] == f"tensor/{quantity}"]
         if mine:
             found[quantity] = plots.Plot(
                 name=f"tensor-{quantity}-over-rank",
@@ -33,6 +33,11 @@ def rank_plots(ranks):
                 legend="map",
             )
     return found
+
+
+def of_all_ranks(ranks):
+    """The records that all ranks have: at further tilings frames are timed with the default rank alone."""
+    return [record for record in ranks.records if record["params"].get("tiling", TILING) == TILING]
 
 
 def labels(records):
@@ -59,7 +64,7 @@ def series(records, label, field, shown):
 def rank_table(ranks):
     """All numbers, a row for each map and rank."""
     rows = {}
-    for record in ranks.records:
+    for record in of_all_ranks(ranks):
         params = record["params"]
         rows.setdefault((params["map"], params["side"], params["rank"]), {})[record["name"]] = record
     columns = [
