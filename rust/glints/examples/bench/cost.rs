@@ -12,7 +12,10 @@ use serde_json::{Value, json};
 /// Texels of the largest footprint that the direct sum is asked over, some ten milliseconds a query.
 pub const LARGEST_DIRECT: f64 = 2048.0 * 2048.0;
 
-/// The same under a Gaussian, which reaches 14 times as many and weights each by itself: some ten milliseconds, too.
+/// Texels that a Gaussian of half a pixel reaches, for each of the pixel's.
+pub const GAUSSIAN_REACH: f64 = 14.0;
+
+/// The same under a Gaussian, which weights each texel by itself: some ten milliseconds, too.
 pub const LARGEST_DIRECT_GAUSSIAN: f64 = 64.0 * 64.0;
 
 /// Length and thickness of a footprint in texels.

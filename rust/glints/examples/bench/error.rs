@@ -9,9 +9,9 @@ use glints::methods::tensor::{Tensor, Uncompressed};
 use crate::cost::{Cell, Random};
 
 /// Relative L1 error of the distribution of normals, the integral of `|D - D_direct| cos` (that of `D_direct
-/// cos` being one), averaged over footprints.
-pub fn of_distribution(method: &dyn Method, direct: &Direct, cell: &Cell) -> f64 {
-    let [error] = mean(method, direct, cell, |footprint, h| {
+/// cos` being one), averaged over footprints. `reach`: texels that the direct sum is over, for each of the cell.
+pub fn of_distribution(method: &dyn Method, direct: &Direct, cell: &Cell, reach: f64) -> f64 {
+    let [error] = mean(method, direct, (cell, reach), |footprint, h| {
         [method.ndf(footprint, h) - direct.ndf(footprint, h)]
     });
     error
@@ -19,7 +19,7 @@ pub fn of_distribution(method: &dyn Method, direct: &Direct, cell: &Cell) -> f64
 
 /// The same of a tensor decomposition, and its parts: against the uncompressed images, and of these against the direct sum.
 pub fn of_tensor(tensor: &Tensor, uncompressed: &Uncompressed, direct: &Direct, cell: &Cell) -> [f64; 3] {
-    mean(tensor, direct, cell, |footprint, h| {
+    mean(tensor, direct, (cell, 1.0), |footprint, h| {
         let (compressed, images) = (tensor.ndf(footprint, h), uncompressed.ndf(footprint, h));
         let exact = direct.ndf(footprint, h);
         [compressed - exact, compressed - images, images - exact]
@@ -31,13 +31,13 @@ pub fn of_tensor(tensor: &Tensor, uncompressed: &Uncompressed, direct: &Direct, 
 fn mean<const N: usize>(
     method: &dyn Method,
     direct: &Direct,
-    cell: &Cell,
+    (cell, reach): (&Cell, f64),
     differences: impl Fn(&Footprint, Vec3) -> [f32; N],
 ) -> [f64; N] {
     const FOOTPRINTS: usize = 16;
     /// Of the direct sum, for all points of a footprint: a single point that only one of the two covers counts as 2.
     const TEXELS: f64 = 1e6;
-    let points = (TEXELS / cell.texels()).clamp(4.0, 256.0) as usize;
+    let points = (TEXELS / (reach * cell.texels())).clamp(4.0, 256.0) as usize;
     let mut random = Random(11);
     let (mut sums, mut count) = ([0.0; N], 0_u32);
     for _ in 0..FOOTPRINTS {

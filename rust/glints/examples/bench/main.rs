@@ -136,8 +136,8 @@ fn measure(
     for cell in arguments.footprint.iter().filter(|cell| cell.is_direct()) {
         let params = with(params, &cell.params());
         let found = [
-            error::of_distribution(&ours.method, &direct, cell),
-            error::of_distribution(&published.method, &direct, cell),
+            error::of_distribution(&ours.method, &direct, cell, 1.0),
+            error::of_distribution(&published.method, &direct, cell, 1.0),
         ];
         let baseline = ("ibm_paper", found[1]);
         print("ibm/ndf_error", found[0], "relative L1", baseline, &params);
@@ -157,7 +157,7 @@ fn measure(
         .iter()
         .filter(|cell| cell.is_direct_gaussian())
     {
-        let error = error::of_distribution(&ours_gaussian, &gaussian, cell);
+        let error = error::of_distribution(&ours_gaussian, &gaussian, cell, cost::GAUSSIAN_REACH);
         let params = with(params, &cell.params());
         let name = "ibm_gaussian/ndf_error";
         print(name, error, "relative L1", ("bound", 0.03), &params);
