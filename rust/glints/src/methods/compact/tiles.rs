@@ -11,7 +11,9 @@
 //! the footprint's border runs through a tile, and a thin footprint costs as much as the tiles that it meets.
 //!
 //! **Tried** Signatures of tiles, a bit for each of 128 parts of the directions in two to four partitions: for 3 to 4 MB they let a
-//! third to a fifth of the tiles pass at a roughness of 0.007, and reading those in no order takes as long as reading all.
+//! third to a fifth of the tiles pass at a roughness of 0.007, and reading those in no order takes as long as reading all. Least and
+//! greatest normals of squares of 4 x 4 texels, 1 MB, let 14 % pass on the isotropic map, whose normals vary slowly, but 60 to 75 % on
+//! brushed and scratched ones and 90 % on flakes: they were not built.
 
 use std::ops::Range;
 
