@@ -344,7 +344,10 @@ def uninterrupted(mini_folder, tmp_path_factory):
 def test_an_interrupted_comparison_goes_on_where_it_stopped(mini_folder, uninterrupted, tmp_path, stop):
     cache = tmp_path / "cache"
     line, environment = command(mini_folder, tmp_path, cache, *OPTIONS)
+    # Who runs the tests in the background may ignore interrupts, and what they start then does, too.
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(line, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    signal.signal(signal.SIGINT, ours)
     while process.poll() is None and len(list(cache.glob("runs/**/*.json"))) < 3:
         time.sleep(0.005)
     os.kill(process.pid, stop)
