@@ -7,25 +7,25 @@ from .tables import Column, table
 from .text import bytes_text, number, seconds_text
 
 QUANTITIES = {
-    "precompute": ("value", "precomputation (s)", seconds_text),
-    "storage": ("ratio", "storage ÷ uncompressed images", number),
-    "ndf_error": ("value", "relative L1 error of the finest images", number),
-    "frame_error": ("ratio", "relative squared error of the picture", number),
-    "frame_eval_ratio": ("value", "evaluation only: time ÷ roughconductor", number),
-    "frame_sample_ratio": ("value", "sampling only: time ÷ roughconductor", number),
+    "precompute": ("value", "precomputation", "seconds", seconds_text),
+    "storage": ("ratio", "storage ÷ uncompressed images", "ratio", number),
+    "ndf_error": ("value", "error of the finest images", "relative L1", number),
+    "frame_error": ("ratio", "squared error of the picture ÷ its mean square", "ratio", number),
+    "frame_eval_ratio": ("value", "evaluation only: time ÷ roughconductor", "ratio", number),
+    "frame_sample_ratio": ("value", "sampling only: time ÷ roughconductor", "ratio", number),
 }
-"""Name of a record, after `tensor/`: which of its numbers is plotted, the axis, and how it is written."""
+"""Name of a record, after `tensor/`: which of its numbers is plotted, the title, the axis, and how it is written."""
 
 
 def rank_plots(ranks):
     """{quantity: `plots.Plot`}, a curve for each map; without a benchmark none."""
     found = {}
-    for quantity, (field, axis, shown) in QUANTITIES.items() if ranks else ():
+    for quantity, (field, title, axis, shown) in QUANTITIES.items() if ranks else ():
         mine = [record for record in of_all_ranks(ranks) if record["name"] == f"tensor/{quantity}"]
         if mine:
             found[quantity] = plots.Plot(
                 name=f"tensor-{quantity}-over-rank",
-                title=axis,
+                title=title,
                 x_label="rank",
                 y_label=axis,
                 series=tuple(series(mine, label, field, shown) for label in labels(mine)),
