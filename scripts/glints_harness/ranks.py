@@ -110,13 +110,14 @@ def measure(scene, maps, ranks, tool, folder, repeats, say):
     records, pictures = [], []
     for label, path in maps.items():
         on_map = replace(scene, values={**scene.values, "normalmap": str(path), "alpha": str(ALPHA)})
-        facts, loaded = {}, {}
+        facts, made, loaded = {}, {}, {}
         for rank in ranks:
             say(f"{label}: rank {rank}")
             file = folder / "precomputed" / f"{label}-{rank}.glints"
             file.parent.mkdir(exist_ok=True)
             facts[rank] = precompute(tool, path, rank, file)
-            loaded[rank] = LoadedScene(on_map.text(method(file), TILING))
+            made[rank] = method(file)
+            loaded[rank] = LoadedScene(on_map.text(made[rank], TILING))
         loaded[UNCOMPRESSED] = LoadedScene(on_map.text(NOT_COMPRESSED, TILING))
         plain = LoadedScene(on_map.text(METHODS["roughconductor"], TILING))
         say(f"{label}: pictures and times")
@@ -126,12 +127,10 @@ def measure(scene, maps, ranks, tool, folder, repeats, say):
             write_exr(file, np.mean(shot, axis=0))
             pictures.append({"map": label, "rank": rank, "file": file.relative_to(folder).as_posix()})
         times = {TILING: frame_times(scene, plain, {rank: loaded[rank] for rank in ranks}, repeats)}
-        if DEFAULT_RANK in ranks:
-            timed = method(folder / "precomputed" / f"{label}-{DEFAULT_RANK}.glints")
-            for tiling in FURTHER_TILINGS:
-                say(f"{label}: times at x{tiling}")
-                item = {DEFAULT_RANK: LoadedScene(on_map.text(timed, tiling))}
-                times[tiling] = frame_times(scene, plain, item, repeats)
+        for tiling in FURTHER_TILINGS if DEFAULT_RANK in ranks else ():
+            say(f"{label}: times at x{tiling}")
+            item = {DEFAULT_RANK: LoadedScene(on_map.text(made[DEFAULT_RANK], tiling))}
+            times[tiling] = frame_times(scene, plain, item, repeats)
         records += map_records(label, path, facts, shots, times)
     write_json(folder / FILE, {"records": records, "pictures": pictures, "provenance": provenance.provenance()})
     return records

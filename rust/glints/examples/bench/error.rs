@@ -19,6 +19,7 @@ pub fn of_distribution(method: &dyn Method, direct: &Direct, cell: &Cell, reach:
 
 /// The same of a tensor decomposition, and its parts: against the uncompressed images, and of these against the direct sum.
 pub fn of_tensor(tensor: &Tensor, uncompressed: &Uncompressed, direct: &Direct, cell: &Cell) -> [f64; 3] {
+    // As many points as under a box: the cells are few.
     mean(tensor, direct, (cell, 1.0), |footprint, h| {
         let (compressed, images) = (tensor.ndf(footprint, h), uncompressed.ndf(footprint, h));
         let exact = direct.ndf(footprint, h);

@@ -115,6 +115,12 @@ pub fn project(normal: Vec3) -> Vec2 {
     normal.truncate() / (1.0 + normal.z).sqrt()
 }
 
+/// Where the projection of a normal lies, in bins.
+#[inline]
+fn position(bins: &Grid, normal: Vec3) -> Vec2 {
+    (project(normal) - bins.low) / bins.pitch
+}
+
 /// Width of the bins over the projection for a map of whose texels `share` are within reach of each other.
 pub fn bin_width(alpha: f32, share: f64) -> f64 {
     let width = if alpha > CURVED {
@@ -262,7 +268,9 @@ impl Counts {
                     .collect();
                 tree.halves(&node).map(|half| {
                     let Some(half) = half else { return [0.0; 2] };
-                    let inside = children.iter().filter(|(child, _)| half.holds(child));
+                    let inside = children
+                        .iter()
+                        .filter(|(child, _)| half.has(tree.rect(child).low));
                     let mut part = vec![0.0; whole.len()];
                     for (_, squares) in inside {
                         part.iter_mut()
@@ -285,11 +293,9 @@ impl Counts {
     pub fn deviation_of_root(&self, tree: &Tree, normal: impl Fn((u32, u32)) -> Vec3) -> Option<f64> {
         let root = tree.root();
         let rect = tree.rect(&root);
-        let [columns, rows] = self.bins.size.map(|side| side as usize);
-        let stride = columns.div_ceil(SQUARE);
         let halves = tree.halves(&root);
         // Of each square: its texels, and those in the left and in the upper half.
-        let mut squares = vec![[0.0_f64; 3]; stride * rows.div_ceil(SQUARE)];
+        let mut squares = vec![[0.0_f64; 3]; self.square_count()];
         for k in 0..SPARSE {
             let place = |bits: u32, side: u32| ((u64::from(bits) * u64::from(side)) >> 32) as u32;
             let texel = (place(hash(k, 0), rect.high.0), place(hash(k, 1), rect.high.1));
@@ -297,8 +303,8 @@ impl Counts {
             if !Self::holds(&self.bins, normal) {
                 continue;
             }
-            let cell = (project(normal) - self.bins.low) / self.bins.pitch;
-            let square = &mut squares[cell.y as usize / SQUARE * stride + cell.x as usize / SQUARE];
+            let bin = position(&self.bins, normal);
+            let square = &mut squares[self.square(bin.x as usize, bin.y as usize)];
             square[0] += 1.0;
             for (count, half) in square[1..].iter_mut().zip(&halves) {
                 *count += f64::from(half.as_ref().is_some_and(|half| half.has(texel)));
@@ -334,13 +340,24 @@ impl Counts {
     /// Counts of a node over squares of bins.
     fn squares(&self, level: &Level, node: usize) -> Vec<f64> {
         let [columns, rows] = self.bins.size.map(|side| side as usize);
-        let stride = columns.div_ceil(SQUARE);
-        let mut sums = vec![0.0; stride * rows.div_ceil(SQUARE)];
+        let mut sums = vec![0.0; self.square_count()];
         for (y, x) in (0..rows).flat_map(|y| (0..columns).map(move |x| (y, x))) {
             let count = level.get(node * self.stride() + y * columns + x);
-            sums[y / SQUARE * stride + x / SQUARE] += f64::from(count);
+            sums[self.square(x, y)] += f64::from(count);
         }
         sums
+    }
+
+    /// The number of squares of bins.
+    fn square_count(&self) -> usize {
+        let [columns, rows] = self.bins.size.map(|side| (side as usize).div_ceil(SQUARE));
+        columns * rows
+    }
+
+    /// The square that holds the bin in a column and row.
+    #[inline]
+    fn square(&self, column: usize, row: usize) -> usize {
+        row / SQUARE * (self.bins.size[0] as usize).div_ceil(SQUARE) + column / SQUARE
     }
 
     fn stride(&self) -> usize {
@@ -350,7 +367,7 @@ impl Counts {
     /// Whether noise leaves a normal inside the bins.
     #[inline]
     pub fn holds(bins: &Grid, normal: Vec3) -> bool {
-        let position = (project(normal) - bins.low) / bins.pitch;
+        let position = position(bins, normal);
         let size = Vec2::new(bins.size[0] as f32, bins.size[1] as f32);
         position.cmpge(Vec2::ONE).all() && position.cmple(size - 1.0).all()
     }
@@ -365,13 +382,10 @@ impl Counts {
     #[inline]
     fn noisy_cell(&self, normal: Vec3, (column, row): (u32, u32)) -> [u32; 2] {
         let hash = hash(column, row);
-        let projection = project(normal);
+        let position = position(&self.bins, normal);
         let triangular = |bits: u32| ((bits & 0xff) + (bits >> 8 & 0xff)) as f32 / 256.0 - 255.0 / 256.0;
         let noise = [triangular(hash), triangular(hash >> 16)];
-        std::array::from_fn(|axis| {
-            let position = (projection[axis] - self.bins.low[axis]) / self.bins.pitch + noise[axis];
-            (position as u32).min(self.bins.size[axis] - 1)
-        })
+        std::array::from_fn(|axis| ((position[axis] + noise[axis]) as u32).min(self.bins.size[axis] - 1))
     }
 
     /// Draws a half vector of the lobe that stands for a texel where its node is counted.

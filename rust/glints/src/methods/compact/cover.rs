@@ -84,9 +84,8 @@ impl Node {
 #[derive(Clone, Copy, Debug)]
 pub struct Half {
     axis: usize,
-    /// First column or row of the other half, in texels and in nodes of the next finer level.
+    /// First column or row of the other half.
     end: u32,
-    end_node: u32,
     /// Of the node's texels.
     pub share: f64,
 }
@@ -96,11 +95,6 @@ impl Half {
     #[inline]
     pub fn has(&self, texel: (u32, u32)) -> bool {
         [texel.0, texel.1][self.axis] < self.end
-    }
-
-    /// Whether it holds a quarter of the node.
-    pub fn holds(&self, child: &Node) -> bool {
-        [child.column, child.row][self.axis] < self.end_node
     }
 
     /// What the deviation of this part by chance is to be multiplied with to be that of a half of all texels.
@@ -303,13 +297,12 @@ impl Tree {
     pub fn halves(&self, node: &Node) -> [Option<Half>; 2] {
         let side = self.side(node.level - 1);
         let Rect { low, high } = self.rect(node);
-        let axes = [(low.0, high.0, node.column), (low.1, high.1, node.row)];
+        let axes = [(low.0, high.0), (low.1, high.1)];
         [0, 1].map(|axis| {
-            let (low, high, index) = axes[axis];
+            let (low, high) = axes[axis];
             (low + side < high).then(|| Half {
                 axis,
                 end: low + side,
-                end_node: 2 * index + 1,
                 share: f64::from(side) / f64::from(high - low),
             })
         })

@@ -112,6 +112,24 @@ pub fn tailed_map(side: u32) -> NormalMap {
     NormalMap::from_normals("tailed", side, side, &tilted).unwrap()
 }
 
+/// Sum of the differences of the distributions at half vectors, over that of the exact values.
+fn relative_error(
+    compact: &CompactBinMap,
+    direct: &Direct,
+    footprints: &[Footprint],
+    halves: &[Vec3],
+) -> f32 {
+    let (mut difference, mut sum) = (0.0, 0.0);
+    for footprint in footprints {
+        for &h in halves {
+            let expected = direct.ndf(footprint, h);
+            difference += (compact.ndf(footprint, h) - expected).abs();
+            sum += expected;
+        }
+    }
+    difference / sum
+}
+
 #[test]
 fn strays_are_added_where_nodes_are_counted() {
     const SIDE: u32 = 256;
@@ -132,19 +150,12 @@ fn strays_are_added_where_nodes_are_counted() {
         strays.len()
     );
     // All of the map, once and a few times: a smaller footprint's border is blurred, which single lobes show.
-    let error = |compact: &CompactBinMap| {
-        let (mut difference, mut sum) = (0.0, 0.0);
-        for width in [256.0, 1024.0] {
-            let edges = [glam::DVec2::new(width, 0.0), glam::DVec2::new(0.0, width)];
-            let footprint = Footprint::in_texels(SIDE, SIDE, glam::DVec2::splat(110.0), edges[0], edges[1]);
-            for &h in strays.iter().step_by(strays.len() / 50) {
-                let expected = direct.ndf(&footprint, h);
-                difference += (compact.ndf(&footprint, h) - expected).abs();
-                sum += expected;
-            }
-        }
-        difference / sum
-    };
+    let footprints = [256.0, 1024.0].map(|width| {
+        let edges = [glam::DVec2::new(width, 0.0), glam::DVec2::new(0.0, width)];
+        Footprint::in_texels(SIDE, SIDE, glam::DVec2::splat(110.0), edges[0], edges[1])
+    });
+    let halves: Vec<Vec3> = strays.iter().step_by(strays.len() / 50).copied().collect();
+    let error = |compact: &CompactBinMap| relative_error(compact, &direct, &footprints, &halves);
     let found = error(&compact);
     // Next to the core few texels are counted, with the noise of counts.
     assert!(found < 0.05, "{found}");
@@ -180,17 +191,13 @@ fn glints_beside_a_bright_coat_are_exact() {
     let edge = glam::DVec2::from_angle(0.4) * 600.0;
     let footprint = Footprint::in_texels(SIDE, SIDE, glam::DVec2::new(400.0, 470.0), edge, edge.perp());
     // Half vectors far from the coat's.
-    let error = |compact: &CompactBinMap| {
-        let (mut difference, mut sum) = (0.0, 0.0);
-        for k in 0..100 {
+    let halves: Vec<Vec3> = (0..100)
+        .map(|k| {
             let turn = Vec2::from_angle(2.4 * k as f32);
-            let h = ((0.08 + 0.001 * k as f32) * turn).extend(1.0).normalize();
-            let expected = direct.ndf(&footprint, h);
-            difference += (compact.ndf(&footprint, h) - expected).abs();
-            sum += expected;
-        }
-        difference / sum
-    };
+            ((0.08 + 0.001 * k as f32) * turn).extend(1.0).normalize()
+        })
+        .collect();
+    let error = |compact: &CompactBinMap| relative_error(compact, &direct, &[footprint], &halves);
     let found = error(&compact);
     assert!(found < 0.04, "{found}");
     // The broken twin: the cover's value everywhere.
@@ -201,30 +208,30 @@ fn glints_beside_a_bright_coat_are_exact() {
 
 #[test]
 fn parts_of_a_map_deviate_by_chance_or_by_streaks() {
-    // A long map, of whose root there are left and right halves only.
-    let roots = |map: &NormalMap, alpha: f32| {
-        let compact = CompactBinMap::new(map, model(alpha));
-        let known: Vec<f64> = compact.deviations.clone();
-        (known, compact)
+    let of = |map: &NormalMap| CompactBinMap::new(map, model(0.05));
+    let of_some = |compact: &CompactBinMap| {
+        let found = compact
+            .counts
+            .deviation_of_root(&compact.tree, |texel| compact.texels.normal(texel));
+        found.unwrap()
     };
-    let (even, compact) = roots(&random_map(512, 256, 0.5, 2), 0.05);
-    let last = *even.last().unwrap();
-    assert!(last > 0.0 && last < 0.2, "{even:?}");
+    // A long map, of whose root there are left and right halves only.
+    let even = of(&random_map(512, 256, 0.5, 2));
+    let last = *even.deviations.last().unwrap();
+    assert!(last > 0.0 && last < 0.2, "{:?}", even.deviations);
     // What some texels tell is about what all counts tell.
-    let sparse = compact
-        .counts
-        .deviation_of_root(&compact.tree, |texel| compact.texels.normal(texel));
-    let sparse = sparse.unwrap();
+    let sparse = of_some(&even);
     assert!(sparse > 0.6 * last && sparse < 1.7 * last, "{sparse} of {last}");
     let rows = random_map(1, 256, 0.5, 2);
     let streaks: Vec<Vec3> = (0..256 * 256).map(|k| rows.normals()[k / 256]).collect();
-    let (streaks, compact) = roots(
-        &NormalMap::from_normals("streaks", 256, 256, &streaks).unwrap(),
-        0.05,
+    let streaks = of(&NormalMap::from_normals("streaks", 256, 256, &streaks).unwrap());
+    let last_of_streaks = streaks.deviations.last();
+    assert_eq!(
+        last_of_streaks,
+        Some(&LARGEST_DEVIATION),
+        "{:?}",
+        streaks.deviations
     );
-    assert_eq!(streaks.last(), Some(&LARGEST_DEVIATION), "{streaks:?}");
-    let sparse = compact
-        .counts
-        .deviation_of_root(&compact.tree, |texel| compact.texels.normal(texel));
-    assert!(sparse.unwrap() > 3.0 * last, "{sparse:?}");
+    let sparse = of_some(&streaks);
+    assert!(sparse > 3.0 * last, "{sparse:?}");
 }

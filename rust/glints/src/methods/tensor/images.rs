@@ -639,10 +639,11 @@ impl Images {
 
 /// The sum of each row of a block.
 fn row_sums(pixels: &[f32; PIXELS]) -> [f32; BLOCK] {
+    let eight = |at: usize| f32x8::from(std::array::from_fn(|k| pixels[at + k]));
     let half = |first: usize| {
         sums(std::array::from_fn(|row| {
-            let row = &pixels[(first + row) * BLOCK..][..BLOCK];
-            eight(row, 0) + eight(row, 8)
+            let at = (first + row) * BLOCK;
+            eight(at) + eight(at + 8)
         }))
     };
     let (upper, lower) = (half(0).to_array(), half(8).to_array());
@@ -745,11 +746,6 @@ fn product<const C: usize>(a: &Components<C>, b: &Components<C>) -> f32x8 {
         sum = a[c].mul_add(b[c], sum);
     }
     sum
-}
-
-#[inline]
-fn eight(values: &[f32], first: usize) -> f32x8 {
-    f32x8::from(std::array::from_fn(|k| values[first + k]))
 }
 
 /// The sum of each vector.

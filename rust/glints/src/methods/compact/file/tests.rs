@@ -1,9 +1,11 @@
 use super::super::tests::{model, random_map, tailed_map};
+use super::super::tiles::Upper;
 use super::*;
 use crate::footprint::Footprint;
 use crate::half_vector::DirectionPair;
 use crate::methods::Method;
 use crate::normal_map::NormalMap;
+use bytemuck::Zeroable;
 use glam::Vec3;
 use proptest::prelude::*;
 use std::path::PathBuf;
@@ -323,13 +325,14 @@ fn sections_are_those_that_fields_ask_for() {
     let mut other = structure.sections();
     other[1] = Section::new(&[0_u64; 3]);
     let mut longer = structure.sections();
-    longer[1] = Section::new(&[0_u32; 3]);
+    let tiles = [Upper::zeroed(); 3];
+    longer[0] = Section::new(&tiles);
     for (sections, word) in [
         (without(0), "sections instead of"),
         (without(3), "sections instead of"),
         (more, "sections instead of"),
         (other, "section 1"),
-        (longer, "section 1 has 3 elements"),
+        (longer, "section 0 has 3 elements"),
     ] {
         KIND.write(&path, &fields, &sections).unwrap();
         let message = refusal(&path);
